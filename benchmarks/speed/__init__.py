@@ -1,0 +1,1 @@
+"""Speed of training, predicting and relabelling, side by side with others; see README.md."""

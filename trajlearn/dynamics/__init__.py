@@ -1,0 +1,17 @@
+"""Formulations of dynamics: relabel, scale, learn, forecast."""
+
+from trajlearn.dynamics.direct_reward import DirectRewardGP, DirectRewardNN
+from trajlearn.dynamics.forecast import Forecast
+from trajlearn.dynamics.one_step import OneStepRegressor
+from trajlearn.dynamics.scaling import BlockScaler, HorizonFeatures
+from trajlearn.dynamics.trajectory import TrajectoryRegressor
+
+__all__ = [
+    "BlockScaler",
+    "DirectRewardGP",
+    "DirectRewardNN",
+    "Forecast",
+    "HorizonFeatures",
+    "OneStepRegressor",
+    "TrajectoryRegressor",
+]

@@ -1,0 +1,98 @@
+"""One interface to any regressor under a formulation: means and variances by member."""
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.base import BaseEstimator, clone
+from sklearn.multioutput import MultiOutputRegressor
+from sklearn.utils import get_tags
+from sklearn.utils.validation import has_fit_parameter
+
+from trajlearn.regressors.mlp import MLPEnsembleRegressor
+
+Floats = NDArray[np.float64]
+Moments = Callable[[Floats], tuple[Floats, Floats | None]]
+
+
+def seeded(estimator: Any, rng: np.random.Generator) -> Any:
+    """Clone with a seed from the parent wherever the estimator, or one inside it, has none."""
+    copy = clone(estimator)
+    for name, value in sorted(copy.get_params().items(), key=lambda item: item[0]):
+        if name.rpartition("__")[2] == "random_state" and value is None:
+            copy.set_params(**{name: int(rng.integers(2**31))})
+    return copy
+
+
+def fit_learner(
+    estimator: BaseEstimator,
+    rows: Floats,
+    targets: Floats,
+    *,
+    weight: Floats | None,
+    groups: NDArray[Any] | None,
+) -> Any:
+    """Fit on scaled rows and targets (n, d); single-output learners get one copy a target.
+
+    Raises
+    ------
+    TypeError
+        If weights are given and the learner does not take them.
+    """
+    if targets.shape[1] > 1 and not get_tags(estimator).target_tags.multi_output:
+        estimator = MultiOutputRegressor(estimator)
+    extra: dict[str, Any] = {}
+    if weight is not None:
+        if not has_fit_parameter(estimator, "sample_weight"):
+            raise TypeError(
+                f"sample_weight was given, but {type(estimator).__name__} does not take weights."
+            )
+        extra["sample_weight"] = weight
+    if groups is not None and has_fit_parameter(estimator, "groups"):
+        extra["groups"] = groups
+    return estimator.fit(rows, targets[:, 0] if targets.shape[1] == 1 else targets, **extra)
+
+
+def takes_weights(estimator: BaseEstimator) -> bool:
+    """Whether a learner takes `sample_weight` (or would, one copy a target)."""
+    return bool(has_fit_parameter(estimator, "sample_weight"))
+
+
+def moments_of(learner: Any) -> Moments:
+    """Function from scaled rows (n, k) to means (E, n, d) and variances (E, n, d) or None."""
+    if isinstance(learner, MLPEnsembleRegressor):
+        predictor = learner.predictor()
+        return lambda rows: learner.moments(predictor(rows))
+    with_std = "return_std" in inspect.signature(learner.predict).parameters
+
+    def moments(rows: Floats) -> tuple[Floats, Floats | None]:
+        if not len(rows):
+            raise ValueError("no rows to predict")
+        if with_std:
+            mean, std = learner.predict(rows, return_std=True)
+            return _by_target(mean, len(rows)), _by_target(std, len(rows)) ** 2
+        return _by_target(learner.predict(rows), len(rows)), None
+
+    return moments
+
+
+def _by_target(values: Any, n_rows: int) -> Floats:
+    return np.asarray(values, dtype=np.float64).reshape(1, n_rows, -1)
+
+
+def mixture(means: Floats, variances: Floats | None, learner: Any) -> tuple[Floats, Floats]:
+    """Mean and variance of the mixture of all members (n, d).
+
+    Raises
+    ------
+    ValueError
+        If the learner gives no variance.
+    """
+    if variances is None:
+        raise ValueError(
+            f"{type(learner).__name__} gives no standard deviation. Use MLPEnsembleRegressor, "
+            "GPRegressor or any regressor whose predict takes return_std."
+        )
+    return means.mean(axis=0), variances.mean(axis=0) + means.var(axis=0)

@@ -1,0 +1,334 @@
+"""What a dynamics estimator predicts: trajectories with their uncertainty."""
+
+from collections.abc import Callable, Sequence
+from statistics import NormalDist
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+from trajlearn.trajectories import TrajectoryDataset
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["Forecast"]
+
+Floats = NDArray[np.float64]
+
+_PER_FORECAST = ("times", "lengths", "initial_states", "initial_times", "start", "diverged_at")
+
+
+class Forecast:
+    """Predicted trajectories of n episodes over H steps.
+
+    Indexing by episode gives a forecast again and `numpy.concatenate` joins forecasts of
+    different lengths, so that `cross_val_predict` works; ``np.asarray(forecast)`` is `mean`.
+
+    Attributes
+    ----------
+    mean : ndarray of shape (n, H, d_s)
+        Predicted states, from the first step after the start; NaN beyond `lengths` (padding),
+        +inf from `diverged_at` on.
+    std : ndarray of shape (n, H, d_s) or None
+        Total predictive standard deviation.
+    samples : ndarray of shape (n_samples, n, H, d_s) or None
+        Whole trajectories.
+    times : ndarray of shape (n, H)
+        Time of each predicted state.
+    horizons : ndarray of shape (H,)
+        Steps after the start, or, from `predict_trajectory`, time after the start.
+    lengths : ndarray of shape (n,)
+        Predicted steps of each episode.
+    diverged_at : ndarray of shape (n,)
+        First step at which a forecast is non-finite or beyond 1e6 training ranges; 0 if none.
+    start : ndarray of shape (n,)
+        Index of the state that each forecast begins at.
+    episode : ndarray of shape (n,) or None
+        Episode of each forecast, where episodes have several starts; otherwise forecast i
+        belongs to episode i.
+    initial_states : ndarray of shape (n, d_s)
+    initial_times : ndarray of shape (n,)
+    state_range : ndarray of shape (2, d_s)
+        Least and greatest training states, which errors are normalised by.
+    state_names : tuple of str
+    actions : {"none", "logged", "policy"}
+        Where the actions of a roll-out came from.
+    """
+
+    def __init__(
+        self,
+        mean: Floats,
+        *,
+        times: Floats,
+        horizons: NDArray[Any],
+        lengths: NDArray[np.intp],
+        initial_states: Floats,
+        initial_times: Floats,
+        start: NDArray[np.intp],
+        diverged_at: NDArray[np.intp],
+        state_range: Floats,
+        state_names: tuple[str, ...],
+        actions: str = "none",
+        std: Floats | None = None,
+        samples: Floats | None = None,
+        episode: NDArray[np.intp] | None = None,
+    ) -> None:
+        self.mean, self.std, self.samples = mean, std, samples
+        self.times, self.horizons, self.lengths = times, horizons, lengths
+        self.initial_states, self.initial_times = initial_states, initial_times
+        self.start, self.episode, self.diverged_at = start, episode, diverged_at
+        self.state_range, self.state_names, self.actions = state_range, state_names, actions
+
+    # -- container ------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    @property
+    def shape(self) -> tuple[int]:
+        """``(n,)``: the sample is the episode."""
+        return (len(self),)
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self.mean, dtype=dtype, copy=copy)
+
+    def __array_function__(
+        self, func: Callable[..., Any], types: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
+    ) -> Any:
+        if func is np.concatenate and len(args) == 1 and not kwargs.get("axis"):
+            return concatenate(list(args[0]))
+        plain = {name: _without_forecasts(value) for name, value in kwargs.items()}
+        return func(*_without_forecasts(args), **plain)
+
+    def __getitem__(self, key: Any) -> "Forecast":
+        if isinstance(key, tuple):
+            # scikit-learn indexes samples with (indices, ...)
+            key = key[0]
+        index = np.atleast_1d(np.arange(len(self))[key])
+        chosen: dict[str, Any] = {name: getattr(self, name)[index] for name in _PER_FORECAST}
+        return self._replace(
+            mean=self.mean[index],
+            std=None if self.std is None else self.std[index],
+            samples=None if self.samples is None else self.samples[:, index],
+            episode=None if self.episode is None else self.episode[index],
+            **chosen,
+        )
+
+    def _replace(self, **changes: Any) -> "Forecast":
+        return Forecast(**(vars(self) | changes))
+
+    def __repr__(self) -> str:
+        parts = [f"n={len(self)}", f"H={self.mean.shape[1]}", f"d_s={self.mean.shape[2]}"]
+        if self.std is not None:
+            parts.append("std")
+        if self.samples is not None:
+            parts.append(f"samples={len(self.samples)}")
+        if self.actions != "none":
+            parts.append(f"actions={self.actions!r}")
+        if self.diverged_at.any():
+            parts.append(f"diverged={int((self.diverged_at > 0).sum())}")
+        return f"Forecast({', '.join(parts)})"
+
+    # -- use ------------------------------------------------------------------------------
+
+    def at(self, horizons: ArrayLike) -> "Forecast":
+        """Only the given entries of `horizons`.
+
+        Raises
+        ------
+        ValueError
+            If a horizon was not predicted, or they are not in order.
+        """
+        wanted = np.atleast_1d(np.asarray(horizons))
+        if (np.diff(wanted) <= 0).any():
+            raise ValueError("horizons must increase strictly.")
+        columns = np.searchsorted(self.horizons, wanted)
+        clipped = np.minimum(columns, len(self.horizons) - 1)
+        missing = wanted[self.horizons[clipped] != wanted]
+        if len(missing):
+            raise ValueError(
+                f"horizons {missing.tolist()} were not predicted; the forecast has "
+                f"{self.horizons[0]}..{self.horizons[-1]}."
+            )
+        steps = columns + 1
+        diverged = np.searchsorted(steps, self.diverged_at) + 1
+        lengths = np.searchsorted(steps, self.lengths, side="right")
+        gone = (self.diverged_at > 0) & (diverged <= len(steps))
+        return self._replace(
+            mean=self.mean[:, columns],
+            std=None if self.std is None else self.std[:, columns],
+            samples=None if self.samples is None else self.samples[:, :, columns],
+            times=self.times[:, columns],
+            horizons=self.horizons[columns],
+            lengths=lengths,
+            diverged_at=np.where(gone, diverged, 0),
+        )
+
+    def interval(self, level: float = 0.9) -> tuple[Floats, Floats]:
+        """Central interval of each state at each step.
+
+        Parameters
+        ----------
+        level : float, default=0.9
+            Probability inside, between 0 and 1.
+
+        Returns
+        -------
+        lower, upper : ndarray of shape (n, H, d_s)
+            Quantiles of the samples if there are some, else Gaussian.
+
+        Raises
+        ------
+        ValueError
+            If the forecast has neither std nor samples.
+        """
+        if not 0 < level < 1:
+            raise ValueError(f"level = {level} must lie between 0 and 1.")
+        if self.samples is not None:
+            tail = (1 - level) / 2
+            lower, upper = np.quantile(self.samples, [tail, 1 - tail], axis=0)
+            return lower, upper
+        if self.std is None:
+            raise ValueError(
+                "the forecast has no uncertainty: ask for return_std=True or n_samples=."
+            )
+        width = NormalDist().inv_cdf(0.5 + level / 2) * self.std
+        return self.mean - width, self.mean + width
+
+    def squared_errors(self, truth: TrajectoryDataset) -> Floats:
+        """Squared error of each state in units of its training range (n, H, d_s).
+
+        NaN where `truth` or the forecast has no such step; +inf from the divergence on.
+
+        Parameters
+        ----------
+        truth : TrajectoryDataset
+            Episodes in the order of the forecasts (by `episode`, where given).
+
+        Raises
+        ------
+        ValueError
+            If the episodes do not match the forecasts, or the horizons are times, not steps.
+        """
+        if not np.issubdtype(np.asarray(self.horizons).dtype, np.integer):
+            raise ValueError(
+                "this forecast is over times, not steps (it comes from predict_trajectory); "
+                "errors against logged episodes need forecast(ds) or predict(ds)."
+            )
+        if self.episode is None and len(truth) != len(self):
+            raise ValueError(f"{len(self)} forecasts, but {len(truth)} episodes to compare with.")
+        if truth.states.shape[1] != self.mean.shape[2]:
+            raise ValueError(
+                f"the forecast has {self.mean.shape[2]} states ({', '.join(self.state_names)}), "
+                f"the episodes {truth.states.shape[1]} ({', '.join(truth.state_names)})."
+            )
+        episode = np.arange(len(self)) if self.episode is None else self.episode
+        steps = self.start[:, None] + self.horizons[None, :]
+        known = steps <= truth.lengths[episode][:, None]
+        rows = truth.offsets[:-1][episode][:, None] + np.where(known, steps, 0)
+        low, high = self.state_range
+        width = np.where(high > low, high - low, 1.0)
+        with np.errstate(over="ignore", invalid="ignore"):
+            squared = ((self.mean - truth.states[rows]) / width) ** 2
+        diverged = (self.diverged_at > 0)[:, None] & (
+            np.arange(1, len(self.horizons) + 1) >= self.diverged_at[:, None]
+        )
+        squared[diverged] = np.inf
+        squared[~known] = np.nan
+        return squared
+
+    def to_dataset(self) -> TrajectoryDataset:
+        """Mean trajectories as episodes, the initial state first; cut where they diverge.
+
+        Raises
+        ------
+        ValueError
+            If a forecast has no finite step.
+        """
+        steps = np.where(self.diverged_at > 0, self.diverged_at - 1, self.lengths)
+        if (steps < 1).any():
+            i = int(np.flatnonzero(steps < 1)[0])
+            raise ValueError(f"forecast {i} has no finite step; leave it out: forecast[mask].")
+        return TrajectoryDataset.from_arrays(
+            [
+                np.concatenate([s0[None], mean[:k]])
+                for s0, mean, k in zip(self.initial_states, self.mean, steps)
+            ],
+            times=[
+                np.concatenate([[t0], times[:k]])
+                for t0, times, k in zip(self.initial_times, self.times, steps)
+            ],
+            state_names=self.state_names,
+        )
+
+    def to_frame(self) -> "pd.DataFrame":
+        """Long table: forecast, horizon, time, then mean (and ``_std``) of each state."""
+        import pandas as pd
+
+        n, n_horizons, _ = self.mean.shape
+        kept = (np.arange(1, n_horizons + 1) <= self.lengths[:, None]).ravel()
+        columns = {
+            "episode": np.repeat(
+                np.arange(n) if self.episode is None else self.episode, n_horizons
+            ),
+            "start": np.repeat(self.start, n_horizons),
+            "horizon": np.tile(self.horizons, n),
+            "time": self.times.ravel(),
+        }
+        for j, name in enumerate(self.state_names):
+            columns[name] = self.mean[..., j].ravel()
+            if self.std is not None:
+                columns[f"{name}_std"] = self.std[..., j].ravel()
+        return pd.DataFrame(columns)[kept].reset_index(drop=True)
+
+
+def _without_forecasts(value: Any) -> Any:
+    """Replace forecasts by their means, also inside lists and tuples."""
+    if isinstance(value, (list, tuple)):
+        return type(value)(_without_forecasts(item) for item in value)
+    return np.asarray(value) if isinstance(value, Forecast) else value
+
+
+def concatenate(forecasts: Sequence[Forecast]) -> Forecast:
+    """Join forecasts episode after episode, padded to the longest horizon."""
+    longest = max(forecasts, key=lambda forecast: len(forecast.horizons))
+    n_horizons = len(longest.horizons)
+    if any(f.episode is not None for f in forecasts):
+        raise ValueError("forecasts with several starts an episode cannot be concatenated.")
+    if any(
+        f.actions != longest.actions or f.mean.shape[2] != longest.mean.shape[2] for f in forecasts
+    ):
+        raise ValueError(
+            "the forecasts differ in their states or in where their actions came from."
+        )
+    for f in forecasts:
+        if not np.array_equal(f.horizons, longest.horizons[: len(f.horizons)]):
+            raise ValueError("the forecasts have different horizons, so they cannot be joined.")
+
+    def joined(name: str, axis: int = 0) -> Floats | None:
+        values = [getattr(forecast, name) for forecast in forecasts]
+        if any(value is None for value in values):
+            return None
+        padded = []
+        for value in values:
+            width = [(0, 0)] * value.ndim
+            width[axis + 1] = (0, n_horizons - value.shape[axis + 1])
+            padded.append(np.pad(value, width, constant_values=np.nan))
+        return np.concatenate(padded, axis=axis)
+
+    rest = {
+        name: np.concatenate([getattr(forecast, name) for forecast in forecasts])
+        for name in _PER_FORECAST
+        if name != "times"
+    }
+    low = np.min([f.state_range[0] for f in forecasts], axis=0)
+    high = np.max([f.state_range[1] for f in forecasts], axis=0)
+    return longest._replace(
+        mean=joined("mean"),
+        std=joined("std"),
+        samples=joined("samples", axis=1),
+        times=joined("times"),
+        state_range=np.stack([low, high]),
+        **rest,
+    )

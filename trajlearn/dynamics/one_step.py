@@ -1,0 +1,386 @@
+"""One-step models: the next state from state and action (or theta), rolled out."""
+
+from collections.abc import Sequence
+from numbers import Integral, Real
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trajlearn._sklearn import Interval, StrOptions
+from trajlearn.dynamics._base import TwoDoorRegressor
+from trajlearn.dynamics._dynamics import DIVERGENCE_RANGES, DynamicsEstimator, Prediction
+from trajlearn.dynamics._learner import mixture
+from trajlearn.dynamics._query import Query
+from trajlearn.dynamics._rollout import InputRows, Limits, expected_step, roll_out, sampled_step
+from trajlearn.dynamics.scaling import BlockScaler
+from trajlearn.exceptions import MissingFieldError, MixedSamplingError
+from trajlearn.regressors.mlp import MLPEnsembleRegressor
+from trajlearn.trajectories import TrajectoryDataset, TransitionRelabeler
+from trajlearn.trajectories._layout import Layout
+from trajlearn.trajectories.times import uniform_step
+
+__all__ = ["OneStepRegressor"]
+
+Floats = NDArray[np.float64]
+
+
+class OneStepRegressor(DynamicsEstimator):
+    """One-step dynamics: (s_t, a_t) -> s_{t+1}, or closed loop (s_t, theta) -> s_{t+1}, rolled out.
+
+    ``actions[t]`` takes s_t to s_{t+1}. A roll-out replays the logged actions, or lets a policy
+    recompute them from the predicted states; with ``inputs="params"`` it needs neither. D, P, DE
+    and PE of the paper are the choices ``n_members`` and ``probabilistic`` of the learner.
+
+    The mean of a forecast averages the members at every step. Standard deviations and samples
+    come from particles that carry the members' differences and noise along (see `propagation`).
+
+    Parameters
+    ----------
+    estimator : regressor or None, default=None
+        Any scikit-learn regressor; None: `MLPEnsembleRegressor` with batches of 128.
+    relabeler : TransitionRelabeler or None, default=None
+        None: ``TransitionRelabeler(inputs=inputs)``.
+    scaler : transformer or None, default=None
+        None: `BlockScaler`.
+    inputs : {"action", "params"} or sequence of str, default="action"
+        What the model sees beside the state, see `TransitionRelabeler`; "params" is the
+        closed-loop variant. Ignored if `relabeler` is given.
+    target : {"change", "state"}, default="change"
+        Learn s_{t+1} - s_t, or s_{t+1} itself.
+    policy : callable or None, default=None
+        ``policy(states (n, d_s), params (n, p), times (n,)) -> actions (n, d_a)``, for roll-outs.
+    rollout_actions : {"auto", "logged", "policy"}, default="auto"
+        "auto": the policy if there is one, else the logged actions.
+    clip_states : float or None, default=None
+        Clip predicted states to this multiple of the training range about its centre.
+    propagation : {"tsinf", "ts1", "expectation"}, default="tsinf"
+        Particles keep one member ("tsinf") or draw one at every step ("ts1"). "expectation":
+        members are averaged at every step, and there is no uncertainty to ask for.
+    n_particles : int, default=50
+        Particles behind a standard deviation.
+    error_score : float, default=-1e12
+        Score of an episode whose forecast diverged.
+    random_state : int, RandomState or None, default=None
+
+    Attributes
+    ----------
+    estimator_, relabeler_, scaler_
+        As fitted.
+    layout_ : mapping from block to slice
+    dt_ : float or None
+        Time step of the training episodes; None where it is an input or unknown (rows).
+    state_range_ : ndarray of shape (2, d_s)
+        Least and greatest training states.
+    n_features_in_ : int
+
+    See Also
+    --------
+    TrajectoryRegressor : any horizon in one evaluation.
+
+    References
+    ----------
+    K. Chua et al., "Deep Reinforcement Learning in a Handful of Trials using Probabilistic
+    Dynamics Models", NeurIPS 2018 (TS1, TSinf).
+
+    Examples
+    --------
+    A linear system is identified exactly, because actions are aligned:
+
+    >>> import numpy as np
+    >>> from sklearn.linear_model import LinearRegression
+    >>> from trajlearn import OneStepRegressor, TrajectoryDataset
+    >>> actions = np.random.default_rng(0).normal(size=(3, 20, 1))
+    >>> states = np.zeros((3, 21, 1))
+    >>> for t in range(20):
+    ...     states[:, t + 1] = 0.9 * states[:, t] + 0.5 * actions[:, t]
+    >>> ds = TrajectoryDataset.from_arrays(states, actions=actions)
+    >>> model = OneStepRegressor(LinearRegression()).fit(ds)
+    >>> bool(np.allclose(model.predict(ds), states[:, 1:]))
+    True
+    """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **TwoDoorRegressor._parameter_constraints,
+        "inputs": [StrOptions({"action", "params"}), "array-like"],
+        "target": [StrOptions({"change", "state"})],
+        "policy": [callable, None],
+        "rollout_actions": [StrOptions({"auto", "logged", "policy"})],
+        "clip_states": [Interval(Real, 0, None, closed="neither"), None],
+        "propagation": [StrOptions({"tsinf", "ts1", "expectation"})],
+        "n_particles": [Interval(Integral, 2, None, closed="left")],
+        "error_score": [Interval(Real, None, 0, closed="both")],
+    }
+
+    def __init__(
+        self,
+        estimator: Any = None,
+        *,
+        relabeler: Any = None,
+        scaler: Any = None,
+        inputs: str | Sequence[str] = "action",
+        target: str = "change",
+        policy: Any = None,
+        rollout_actions: str = "auto",
+        clip_states: float | None = None,
+        propagation: str = "tsinf",
+        n_particles: int = 50,
+        error_score: float = -1e12,
+        random_state: Any = None,
+    ) -> None:
+        self.estimator = estimator
+        self.relabeler = relabeler
+        self.scaler = scaler
+        self.inputs = inputs
+        self.target = target
+        self.policy = policy
+        self.rollout_actions = rollout_actions
+        self.clip_states = clip_states
+        self.propagation = propagation
+        self.n_particles = n_particles
+        self.error_score = error_score
+        self.random_state = random_state
+
+    def _defaults(self) -> dict[str, Any]:
+        return {
+            "estimator": MLPEnsembleRegressor(batch_size=128),
+            "relabeler": TransitionRelabeler(inputs=self.inputs),
+            "scaler": BlockScaler(),
+        }
+
+    def _layout_of_rows(self, n_features: int, n_targets: int) -> Layout:
+        if n_features < n_targets:
+            raise ValueError(
+                f"rows have n_features = {n_features}, but {n_targets} target(s) need at least "
+                f"{n_targets} columns: the {n_targets} state(s), then actions or params."
+            )
+        rest = self.inputs if isinstance(self.inputs, str) else "action"
+        return Layout.of_rows(n_features, n_targets, (rest,))
+
+    # -- fitting --------------------------------------------------------------------------
+
+    def _fit_rows(self, rows: Floats, targets: Floats, weight: Floats | None, groups: Any) -> None:
+        if not hasattr(self.relabeler_, "dt_"):
+            states = np.concatenate([rows[:, self.layout_["state"]], targets])
+            self._learn_ranges(states, tuple(self.layout_.columns["state"]), np.inf)
+            self.relabeler_.dt_ = None
+        self.dt_ = self.relabeler_.dt_
+        change = self._change(rows, targets)
+        mean = np.average(change, axis=0, weights=weight)
+        scale = np.sqrt(np.average((change - mean) ** 2, axis=0, weights=weight))
+        floor = 1e-12 * np.maximum(np.abs(targets).max(axis=0), 1e-300)
+        self.target_scale_ = np.where(scale > floor, scale, 1.0)
+        super()._fit_rows(rows, targets, weight, groups)
+
+    def _fit_episodes(
+        self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
+    ) -> None:
+        rows, targets = self.relabeler_.fit_resample(ds)
+        self.layout_ = self.relabeler_.layout_
+        # a model of one step knows no longest horizon
+        self._learn_ranges(ds.states, ds.state_names, np.inf)
+        episode = self.relabeler_.sample_indices_
+        self._fit_rows(
+            rows,
+            targets,
+            None if weight is None else weight[episode],
+            None if groups is None else groups[episode],
+        )
+
+    def _change(self, rows: Floats, targets: Floats) -> Floats:
+        return targets - rows[:, self.layout_["state"]] if self.target == "change" else targets
+
+    def _learning_targets(self, rows: Floats, targets: Floats) -> tuple[Floats, Floats | None]:
+        return self._change(rows, targets) / self.target_scale_, None
+
+    def _restore(self, rows: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:
+        means = means * self.target_scale_
+        if self.target == "change":
+            means = means + rows[:, self.layout_["state"]]
+        return means, variances * self.target_scale_**2
+
+    # -- forecasting ----------------------------------------------------------------------
+
+    def _source(self, ds: TrajectoryDataset, actions: str, policy: Any) -> tuple[str, Any]:
+        """Where the actions come from: "none", "logged" or "policy", and the policy."""
+        policy = self.policy if policy is None else policy
+        if "action" not in self.layout_:
+            return "none", None
+        choice = self.rollout_actions if actions == "auto" else actions
+        if choice == "auto":
+            choice = "logged" if policy is None else "policy"
+        if choice == "policy" and policy is None:
+            raise ValueError(
+                "actions='policy' needs a policy: give policy= here or in the constructor, or "
+                "roll out with actions='logged'."
+            )
+        if choice == "logged" and ds.actions is None:
+            raise MissingFieldError(
+                f"{type(self).__name__} needs actions to roll out, but the episodes have none. "
+                "Give policy=, or a model with inputs='params'."
+            )
+        if choice == "logged":
+            block = self.layout_["action"]
+            if len(ds.action_names) != block.stop - block.start:
+                raise ValueError(
+                    f"the episodes have {len(ds.action_names)} actions, the model was fitted on "
+                    f"{block.stop - block.start}."
+                )
+        return choice, policy
+
+    def _reads_logged_future(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
+        return self._source(ds, actions, policy)[0] == "logged" or "references" in self.layout_
+
+    def _forecast(
+        self,
+        query: Query,
+        *,
+        actions: str,
+        policy: Any,
+        return_std: bool,
+        n_samples: int | None,
+        rng: np.random.Generator,
+    ) -> Prediction:
+        source, policy = self._source(query.ds, actions, policy)
+        self._check_time_step(query.ds)
+        moments = self._moments()
+        initial, n_steps = query.initial_states, query.n_steps
+        mean = roll_out(
+            initial,
+            n_steps,
+            self._input_rows(query, source, policy, copies=1),
+            expected_step(moments),
+            self._limits(),
+        )
+        prediction = Prediction(mean, actions=source)
+        n_paths = max(n_samples or 0, self.n_particles if return_std else 0)
+        if not n_paths:
+            return prediction
+        self._check_uncertainty(moments, query)
+        member = None
+        n_members = getattr(self.estimator_, "n_members", 1)
+        if self.propagation == "tsinf":
+            member = np.repeat(rng.permutation(np.arange(n_paths) % n_members), len(query))
+        paths = roll_out(
+            np.tile(initial, (n_paths, 1)),
+            n_steps,
+            self._input_rows(query, source, policy, copies=n_paths),
+            sampled_step(moments, member, rng),
+            self._limits(),
+        ).reshape(n_paths, *mean.shape)
+        if return_std:
+            with np.errstate(invalid="ignore"):
+                spread = paths.std(axis=0)
+            prediction.std = np.where(np.isinf(paths).any(axis=0), np.inf, spread)
+        if n_samples:
+            prediction.samples = paths[:n_samples].copy()
+        return prediction
+
+    def _check_uncertainty(self, moments: Any, query: Query) -> None:
+        if self.propagation == "expectation":
+            raise ValueError(
+                'propagation="expectation" carries no uncertainty: choose "tsinf" or "ts1" for '
+                "return_std= or n_samples=."
+            )
+        width = self.layout_.width
+        means, variances = moments(np.zeros((1, width)))
+        mixture(means, variances, self.estimator_)
+
+    def _check_time_step(self, ds: TrajectoryDataset) -> None:
+        if "dt" in self.layout_ or self.dt_ is None:
+            return
+        dt = uniform_step(ds)
+        if abs(dt - self.dt_) > 1e-3 * self.dt_:
+            raise MixedSamplingError(
+                f"the model was fitted on steps of {self.dt_:g}, the episodes have steps of "
+                f"{dt:g}. "
+                'Resample them (ds.resample), or fit with "dt" among inputs=.'
+            )
+
+    def _limits(self) -> Limits:
+        low, high = self.state_range_
+        width = np.where(high > low, high - low, 1.0)
+        centre = (low + high) / 2
+        clip = None
+        if self.clip_states is not None:
+            clip = (centre - self.clip_states * width / 2, centre + self.clip_states * width / 2)
+        return Limits(clip, centre, DIVERGENCE_RANGES * width)
+
+    def _input_rows(self, query: Query, source: str, policy: Any, *, copies: int) -> InputRows:
+        """Rows of inputs at each step of a roll-out; only known signals and actions enter."""
+        ds = query.ds
+        blocks: dict[str, Floats] = {}
+        if "params" in self.layout_ or source == "policy":
+            theta = self._theta(query)
+        if "context" in self.layout_:
+            blocks["context"] = self.relabeler_.context_rows(ds)
+        if "references" in self.layout_:
+            ds.require("references", by=f"{type(self).__name__} (fitted with references)")
+            assert ds.references is not None
+            references = query.future(ds.references, steps=False)
+        logged = None
+        if source == "logged":
+            assert ds.actions is not None  # _source has checked
+            logged = query.future(ds.actions, steps=True)
+        times = np.concatenate([query.initial_times[:, None], query.times], axis=1)
+        times = _filled(times)
+
+        def inputs(states: Floats, k: int) -> Floats:
+            now: dict[str, Floats] = {"state": states}
+            if logged is not None:
+                blocks["action"] = logged[:, k]
+            elif source == "policy":
+                by_copy = np.tile(theta[:, k], (copies, 1))
+                actions = policy(states, by_copy, np.tile(times[:, k], copies))
+                now["action"] = _checked_actions(actions, self.layout_["action"], states)
+            if "params" in self.layout_:
+                blocks["params"] = theta[:, k]
+            if "dt" in self.layout_:
+                blocks["dt"] = (times[:, k + 1] - times[:, k])[:, None]
+            if "references" in self.layout_:
+                blocks["references"] = np.concatenate(
+                    [references[:, k], references[:, k + 1]], axis=1
+                )
+            for block, values in blocks.items():
+                now[block] = values if copies == 1 else np.tile(values, (copies, 1))
+            return self.layout_.assemble(now)
+
+        return inputs
+
+    def _theta(self, query: Query) -> Floats:
+        """theta_t along the roll-out (n, H, p)."""
+        params = query.ds.step_params if query.ds.params_vary else None
+        if params is None:
+            return np.repeat(query.params()[:, None], query.n_steps, axis=1)
+        return query.future(params, steps=True)
+
+    def _time_grid(self, horizons: Floats) -> tuple[Floats, NDArray[np.intp]]:
+        if "dt" in self.layout_:
+            return super()._time_grid(horizons)
+        dt = 1.0 if self.dt_ is None else self.dt_
+        steps = np.round(horizons / dt).astype(np.intp)
+        if (np.abs(steps * dt - horizons) > 1e-3 * dt).any():
+            raise ValueError(
+                f"horizons must be multiples of the time step {dt:g} of a one-step model; "
+                "TrajectoryRegressor predicts any."
+            )
+        return np.arange(1, steps[-1] + 1) * dt, steps - 1
+
+
+def _filled(times: Floats) -> Floats:
+    """Replace the padding at the end of a row by its last time."""
+    known = np.where(np.isfinite(times), np.arange(times.shape[1]), 0)
+    return np.take_along_axis(times, np.maximum.accumulate(known, axis=1), axis=1)
+
+
+def _checked_actions(actions: Any, block: slice, states: Floats) -> Floats:
+    actions = np.asarray(actions, dtype=np.float64)
+    want = (len(states), block.stop - block.start)
+    if actions.shape != want:
+        raise ValueError(
+            f"the policy returned actions of shape {actions.shape} for {len(states)} states; "
+            f"expected {want}."
+        )
+    if not np.isfinite(actions).all():
+        raise ValueError("the policy returned NaN or infinite actions for finite states.")
+    return actions

@@ -1,0 +1,233 @@
+"""Scaling rows block by block, and features of the horizon."""
+
+from numbers import Integral
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, TransformerMixin, clone
+from sklearn.preprocessing import (
+    FunctionTransformer,
+    MaxAbsScaler,
+    MinMaxScaler,
+    RobustScaler,
+    StandardScaler,
+)
+from sklearn.utils.validation import check_is_fitted, has_fit_parameter, validate_data
+
+from trajlearn._sklearn import HasMethods, Interval, StrOptions
+from trajlearn.trajectories._layout import Layout
+
+__all__ = ["BlockScaler", "HorizonFeatures"]
+
+Floats = NDArray[np.float64]
+
+# scikit-learn's scalers that map each column x to a * x + b
+_AFFINE = (StandardScaler, MinMaxScaler, MaxAbsScaler, RobustScaler)
+# a spread below this share of the largest magnitude is round-off
+_CONSTANT = 1e-6
+# blocks that share the slot of another
+_SLOT_OF = {"references": "state", "dt": "action", "phase": "action"}
+
+
+class HorizonFeatures(TransformerMixin, BaseEstimator):
+    r"""Features of a horizon h on all time scales of the data.
+
+    With L the longest horizon and d the shortest: :math:`2h/L - 1`,
+    :math:`2\,\mathrm{arsinh}(h/d)/\mathrm{arsinh}(L/d) - 1` (a logarithm that is defined for all h)
+    and :math:`1 - 2\exp(-|h|/\tau)` for `n_scales` decay times :math:`\tau` in geometric steps
+    from 2 d to L. A network that sees h alone cannot resolve its first steps.
+
+    Parameters
+    ----------
+    n_scales : int, default=6
+
+    Attributes
+    ----------
+    longest_, shortest_ : ndarray of shape (n_columns,)
+    scales_ : ndarray of shape (n_scales, n_columns)
+        Decay times in the unit of h.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from trajlearn import HorizonFeatures
+    >>> HorizonFeatures(n_scales=2).fit(np.arange(1.0, 101.0)[:, None]).scales_[:, 0]
+    array([  2., 100.])
+    """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        "n_scales": [Interval(Integral, 0, None, closed="left")]
+    }
+
+    def __init__(self, *, n_scales: int = 6) -> None:
+        self.n_scales = n_scales
+
+    def fit(self, X: ArrayLike, y: None = None) -> Self:
+        """Learn L, d and the decay times of each column from horizons (n, n_columns)."""
+        self._validate_params()
+        h = np.abs(validate_data(self, X, dtype=np.float64))
+        longest = h.max(axis=0)
+        self.longest_ = np.where(longest > 0, longest, 1.0)
+        shortest = np.where(h > 0, h, np.inf).min(axis=0)
+        self.shortest_ = np.clip(shortest, self.longest_ / 1000, self.longest_)
+        first = np.minimum(2 * self.shortest_, self.longest_)
+        self.scales_ = np.geomspace(first, self.longest_, self.n_scales)
+        return self
+
+    def transform(self, X: ArrayLike) -> Floats:
+        """Features (n, (2 + n_scales) * n_columns)."""
+        check_is_fitted(self)
+        return self.features(validate_data(self, X, dtype=np.float64, reset=False))
+
+    def features(self, h: Floats) -> Floats:
+        """`transform` without validation, for hot loops."""
+        linear = 2 * h / self.longest_ - 1
+        full = np.arcsinh(self.longest_ / self.shortest_)
+        logarithmic = 2 * np.arcsinh(h / self.shortest_) / full - 1
+        decays = [1 - 2 * np.exp(-np.abs(h) / scale) for scale in self.scales_]
+        return np.concatenate([linear, logarithmic, *decays], axis=1)
+
+
+class BlockScaler(TransformerMixin, BaseEstimator):
+    """Scale each block of a row by a transformer of its own.
+
+    Each slot is a scikit-learn transformer, ``"passthrough"``, or None for the default: states,
+    actions, references and phases to mean 0 and variance 1, params and horizons to [-1, 1], the
+    one-hot context as it is. A column that is constant up to round-off is divided by its
+    magnitude instead, so that a later change of a tenth stays a tenth.
+
+    Parameters
+    ----------
+    state, action, horizon, params : transformer, "passthrough" or None, default=None
+
+    Attributes
+    ----------
+    parts_ : list of (columns, transformer)
+        Columns of the input and the fitted transformer (None: division by `magnitude_`).
+    """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        slot: [HasMethods(["fit", "transform"]), StrOptions({"passthrough"}), None]
+        for slot in ("state", "action", "horizon", "params")
+    }
+
+    def __init__(
+        self, *, state: Any = None, action: Any = None, horizon: Any = None, params: Any = None
+    ) -> None:
+        self.state = state
+        self.action = action
+        self.horizon = horizon
+        self.params = params
+
+    def fit(
+        self,
+        X: ArrayLike,
+        y: None = None,
+        *,
+        layout: Layout | None = None,
+        sample_weight: Floats | None = None,
+    ) -> Self:
+        """Fit the transformer of each block.
+
+        Parameters
+        ----------
+        X : array-like of shape (n, n_features)
+        y : None
+        layout : mapping from block to slice, optional
+            Default: all columns are states.
+        sample_weight : ndarray of shape (n,), optional
+            Passed to the transformers that take it.
+        """
+        self._validate_params()
+        rows: Floats = validate_data(self, X, dtype=np.float64)
+        if layout is None:
+            layout = Layout.of_rows(rows.shape[1], rows.shape[1], ("params",))
+        largest = np.abs(rows).max(axis=0)
+        constant = np.ptp(rows, axis=0) <= _CONSTANT * largest
+        self.magnitude_ = np.where(largest > 0, largest, 1.0)
+        self.parts_: list[tuple[NDArray[np.intp], Any]] = []
+        self.block_columns_: dict[str, NDArray[np.intp]] = {}
+        width = 0
+        for block, where in layout.items():
+            columns = np.arange(rows.shape[1])[where]
+            varying = columns[~constant[columns]]
+            begin = width
+            if len(varying):
+                transformer = self._transformer(block)
+                values = rows[:, varying]
+                if sample_weight is not None and has_fit_parameter(transformer, "sample_weight"):
+                    transformer.fit(values, sample_weight=sample_weight)
+                else:
+                    transformer.fit(values)
+                self.parts_.append((varying, transformer))
+                width += np.shape(transformer.transform(values[:1]))[1]
+            if constant[columns].any():
+                self.parts_.append((columns[constant[columns]], None))
+                width += int(constant[columns].sum())
+            self.block_columns_[block] = np.arange(begin, width)
+        self._set_affine()
+        return self
+
+    def _transformer(self, block: str) -> Any:
+        slot = _SLOT_OF.get(block, block)
+        chosen = "passthrough" if slot == "context" else getattr(self, slot)
+        if chosen == "passthrough":
+            return FunctionTransformer()
+        if chosen is not None:
+            return clone(chosen)
+        return StandardScaler() if slot in ("state", "action") else MinMaxScaler((-1, 1))
+
+    def _set_affine(self) -> None:
+        """Scale and shift of all outputs, where every part is affine: one fused operation."""
+        self.affine_: tuple[NDArray[np.intp], Floats, Floats] | None = None
+        maps = [
+            (1 / self.magnitude_[columns], np.zeros(len(columns)))
+            if transformer is None
+            else _affine(transformer, len(columns))
+            for columns, transformer in self.parts_
+        ]
+        if all(part is not None for part in maps):
+            columns = np.concatenate([columns for columns, _ in self.parts_])
+            scale, shift = (np.concatenate(parts) for parts in zip(*maps))
+            self.affine_ = columns, scale, shift
+
+    def transform(self, X: ArrayLike) -> Floats:
+        """Scaled rows (n, width), blocks in order."""
+        check_is_fitted(self)
+        return self.scaled(validate_data(self, X, dtype=np.float64, reset=False))
+
+    def scaled(self, X: Floats) -> Floats:
+        """`transform` without validation, for hot loops."""
+        if self.affine_ is not None:
+            columns, scale, shift = self.affine_
+            return X[:, columns] * scale + shift
+        parts = []
+        for columns, transformer in self.parts_:
+            values = X[:, columns]
+            if transformer is None:
+                parts.append(values / self.magnitude_[columns])
+            elif isinstance(transformer, HorizonFeatures):
+                parts.append(transformer.features(values))
+            elif (affine := _affine(transformer, len(columns))) is not None:
+                parts.append(values * affine[0] + affine[1])
+            else:
+                parts.append(np.asarray(transformer.transform(values)))
+        return np.concatenate(parts, axis=1)
+
+
+def _affine(transformer: Any, width: int) -> tuple[Floats, Floats] | None:
+    """Scale and shift of a fitted transformer that maps each column x to a * x + b."""
+    if isinstance(transformer, FunctionTransformer) and transformer.func is None:
+        return np.ones(width), np.zeros(width)
+    if not isinstance(transformer, _AFFINE) or getattr(transformer, "clip", False):
+        return None
+    if isinstance(transformer, MinMaxScaler):
+        return transformer.scale_, transformer.min_
+    scale = np.ones(width) if getattr(transformer, "scale_", None) is None else transformer.scale_
+    centre = getattr(transformer, "mean_", None)
+    if isinstance(transformer, RobustScaler):
+        centre = transformer.center_
+    if isinstance(transformer, StandardScaler) and not transformer.with_mean:
+        centre = None
+    return 1 / scale, np.zeros(width) if centre is None else -centre / scale

@@ -1,0 +1,366 @@
+"""Trajectory-based models: the state after a horizon in one evaluation."""
+
+from numbers import Real
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trajlearn._sklearn import Interval, StrOptions
+from trajlearn.dynamics._base import TwoDoorRegressor
+from trajlearn.dynamics._dynamics import DynamicsEstimator, Prediction
+from trajlearn.dynamics._learner import mixture, takes_weights
+from trajlearn.dynamics._query import Query, make_query
+from trajlearn.dynamics.scaling import BlockScaler, HorizonFeatures
+from trajlearn.regressors.mlp import MLPEnsembleRegressor
+from trajlearn.trajectories import SubtrajectoryRelabeler, TrajectoryDataset
+from trajlearn.trajectories._columns import runs
+from trajlearn.trajectories._layout import Layout
+from trajlearn.trajectories._pairs import Stretches
+
+__all__ = ["TrajectoryRegressor"]
+
+Floats = NDArray[np.float64]
+
+# rows that fix the scalers where the learner gets fresh ones at every step
+_SCALER_ROWS = 16_384
+# rows predicted at once where the horizons differ between starts
+_CHUNK_ROWS = 8_192
+# training episodes whose residuals give the correlation of a sampled path
+_RESIDUAL_EPISODES = 32
+
+
+class TrajectoryRegressor(DynamicsEstimator):
+    r"""Trajectory-based dynamics: (s_t, h, theta) -> s_{t+h} in one evaluation.
+
+    The controller enters by its parameters theta, not by its actions, so that nothing is rolled
+    out and errors do not compound. Trained on all sub-trajectories of the episodes:
+
+    .. math:: s_{t+h} = b + g(h)\,\sigma \odot f(s_t, h, \theta),
+
+    with the baseline b = s_t, the gate :math:`g(h) = 1 - e^{-h / \tau}`, which makes short
+    horizons exact, and the scale :math:`\sigma` of the change of state. T, TP, TE and TPE of the
+    paper are the choices ``n_members`` and ``probabilistic`` of the learner.
+
+    Parameters
+    ----------
+    estimator : regressor or None, default=None
+        Any scikit-learn regressor; None: `MLPEnsembleRegressor`.
+    relabeler : SubtrajectoryRelabeler or None, default=None
+        None: ``SubtrajectoryRelabeler(starts="early", horizons="mixture")``.
+    scaler : transformer or None, default=None
+        None: `BlockScaler` with `HorizonFeatures` for the horizon.
+    baseline : {"state", None}, default="state"
+        What a prediction is relative to; None predicts the state itself, as the paper does.
+    gate : float or None, default=0.05
+        Time constant of the gate as a fraction of the longest horizon; None for no gate.
+    fresh_batches : bool, default=True
+        Draw new sub-trajectories for every batch if the learner has `fit_stream`; otherwise (and
+        for other learners) fit on one draw of the relabeler.
+    error_score : float, default=-1e12
+        Score of an episode whose forecast diverged.
+    random_state : int, RandomState or None, default=None
+
+    Attributes
+    ----------
+    estimator_, relabeler_, scaler_
+        As fitted.
+    layout_ : mapping from block to slice
+    max_horizon_ : float
+        Longest horizon in training, as a time.
+    state_range_ : ndarray of shape (2, d_s)
+        Least and greatest training states.
+    noise_time_ : ndarray of shape (d_s,)
+        Correlation time of the residuals along a trajectory, for sampled paths.
+    n_features_in_ : int
+
+    See Also
+    --------
+    OneStepRegressor : models of one step, rolled out.
+
+    References
+    ----------
+    N. Lambert et al., "Learning Accurate Long-term Dynamics for Model-based Reinforcement
+    Learning", CDC 2021.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from trajlearn import TrajectoryDataset, TrajectoryRegressor
+    >>> rate = np.linspace(0.5, 1.5, 20)  # s' = -theta s, from s_0 = 1
+    >>> states = np.exp(-rate[:, None] * 0.1 * np.arange(31))[..., None]
+    >>> ds = TrajectoryDataset.from_arrays(states, params=rate[:, None], dt=0.1)
+    >>> model = TrajectoryRegressor(random_state=0).set_params(estimator__max_steps=300).fit(ds)
+    >>> forecast = model.predict_trajectory([1.0], params=[0.77], horizons=[1.0, 2.5])
+    >>> bool(np.abs(forecast.mean[0, :, 0] - np.exp([-0.77, -0.77 * 2.5])).max() < 0.02)
+    True
+    """
+
+    _needs_constant_params = True
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **TwoDoorRegressor._parameter_constraints,
+        "baseline": [StrOptions({"state"}), None],
+        "gate": [Interval(Real, 0, None, closed="neither"), None],
+        "fresh_batches": ["boolean"],
+        "error_score": [Interval(Real, None, 0, closed="both")],
+    }
+
+    def __init__(
+        self,
+        estimator: Any = None,
+        *,
+        relabeler: Any = None,
+        scaler: Any = None,
+        baseline: str | None = "state",
+        gate: float | None = 0.05,
+        fresh_batches: bool = True,
+        error_score: float = -1e12,
+        random_state: Any = None,
+    ) -> None:
+        self.estimator = estimator
+        self.relabeler = relabeler
+        self.scaler = scaler
+        self.baseline = baseline
+        self.gate = gate
+        self.fresh_batches = fresh_batches
+        self.error_score = error_score
+        self.random_state = random_state
+
+    def _defaults(self) -> dict[str, Any]:
+        return {
+            "estimator": MLPEnsembleRegressor(),
+            "relabeler": SubtrajectoryRelabeler(starts="early", horizons="mixture"),
+            "scaler": BlockScaler(horizon=HorizonFeatures()),
+        }
+
+    def _layout_of_rows(self, n_features: int, n_targets: int) -> Layout:
+        if n_features <= n_targets:
+            raise ValueError(
+                f"rows have n_features = {n_features}, but {n_targets} target(s) need at least "
+                f"{n_targets + 1} columns: the {n_targets} state(s), the horizon, then params."
+            )
+        return Layout.of_rows(n_features, n_targets, ("horizon", "params"))
+
+    # -- fitting --------------------------------------------------------------------------
+
+    def _fit_rows(self, rows: Floats, targets: Floats, weight: Floats | None, groups: Any) -> None:
+        horizons = np.abs(rows[:, self.layout_["horizon"]])
+        states = np.concatenate([rows[:, self.layout_["state"]], targets])
+        names = tuple(self.layout_.columns["state"])
+        self._learn_ranges(states, names, float(horizons.max()))
+        self.noise_time_ = np.full(targets.shape[1], np.inf)
+        self._learn_scale(rows, targets, weight)
+        super()._fit_rows(rows, targets, weight, groups)
+
+    def _fit_episodes(
+        self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
+    ) -> None:
+        relabeler = self.relabeler_.fit(ds)
+        self.layout_ = relabeler.layout_
+        self._learn_ranges(ds.states, ds.state_names, self._longest_horizon(ds))
+        if self.fresh_batches and hasattr(self.estimator_, "fit_stream"):
+            self._fit_stream(ds, weight)
+        else:
+            rows, targets = relabeler.fit_resample(ds)
+            episode = relabeler.sample_indices_
+            by_row = None if weight is None else weight[episode]
+            self._learn_scale(rows, targets, by_row)
+            labels = None if groups is None else groups[episode]
+            super()._fit_rows(rows, targets, by_row, labels)
+        self._learn_noise_time(ds)
+
+    def _longest_horizon(self, ds: TrajectoryDataset) -> float:
+        """Longest time between two states that the relabeler may pair."""
+        stretches = Stretches.of(ds)
+        most = getattr(self.relabeler_, "max_horizon", None)
+        steps = stretches.n_steps if most is None else np.minimum(stretches.n_steps, most)
+        n_starts = stretches.n_steps - steps + 1
+        first = runs(stretches.first_row, n_starts)
+        last = first + np.repeat(steps, n_starts)
+        return float((ds.times[last] - ds.times[first]).max())
+
+    def _fit_stream(self, ds: TrajectoryDataset, weight: Floats | None) -> None:
+        """Fresh sub-trajectories for every batch."""
+        draw_pairs = self.relabeler_.sampler(ds)
+        rows, targets, episode = draw_pairs(_SCALER_ROWS, self._rng)
+        by_row = None if weight is None else weight[episode]
+        self._learn_scale(rows, targets, by_row)
+        self._fit_scaler(rows, by_row)
+
+        def draw(n: int, rng: np.random.Generator) -> tuple[Floats, Floats, Floats | None]:
+            rows, targets, episode = draw_pairs(n, rng)
+            z, factor = self._learning_targets(rows, targets)
+            if weight is not None:
+                factor = weight[episode] if factor is None else factor * weight[episode]
+            return self._scaled(rows), z, factor
+
+        self.estimator_.fit_stream(draw, n_rows=self.relabeler_.n_pairs(ds))
+
+    def _learn_scale(self, rows: Floats, targets: Floats, weight: Floats | None) -> None:
+        """Scale of what is predicted: the state, or its change."""
+        change = targets - self._baseline(rows)
+        mean = np.average(change, axis=0, weights=weight)
+        scale = np.sqrt(np.average((change - mean) ** 2, axis=0, weights=weight))
+        floor = 1e-12 * np.maximum(np.abs(targets).max(axis=0), 1e-300)
+        self.target_scale_ = np.where(scale > floor, scale, 1.0)
+
+    def _baseline(self, rows: Floats) -> Floats | float:
+        return rows[:, self.layout_["state"]] if self.baseline == "state" else 0.0
+
+    def _gate(self, rows: Floats) -> Floats:
+        """g(h) of each row (n, 1); not quite 0 at h = 0, since targets are divided by it."""
+        if self.gate is None or self.baseline is None:
+            return np.ones((len(rows), 1))
+        horizon = np.abs(rows[:, self.layout_["horizon"]])
+        gate = -np.expm1(-horizon / (self.gate * (self.max_horizon_ or 1.0)))
+        return np.maximum(gate, 1e-3)
+
+    def _learning_targets(self, rows: Floats, targets: Floats) -> tuple[Floats, Floats | None]:
+        gate = self._gate(rows)
+        if not takes_weights(self.estimator_):
+            gate = np.ones_like(gate)
+        self._gated = takes_weights(self.estimator_)
+        z = (targets - self._baseline(rows)) / (gate * self.target_scale_)
+        # the squared error of the state, not of z
+        return z, gate[:, 0] ** 2 if (gate != 1).any() else None
+
+    def _restore(self, rows: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:
+        gate = self._gate(rows) if self._gated else 1.0
+        scale = gate * self.target_scale_
+        return self._baseline(rows) + scale * means, scale**2 * variances
+
+    def _learn_noise_time(self, ds: TrajectoryDataset) -> None:
+        """Correlation time of standardised residuals along training episodes, by state."""
+        few = ds[:_RESIDUAL_EPISODES]
+        query, _ = make_query(few, 0, None, within_log=True, within_stretch=True)
+        means, variances = self._at(query)
+        mean = means.mean(axis=0)
+        std = np.ones_like(mean)
+        if variances is not None:
+            std = np.sqrt(np.maximum(mixture(means, variances, self.estimator_)[1], 1e-300))
+        truth = query.future(few.states, steps=False)[:, 1:]
+        residual = np.where(query.known()[..., None], (truth - mean) / std, 0.0)
+        now, then = residual[:, :-1], residual[:, 1:]
+        power = np.sqrt((now**2).sum(axis=(0, 1)) * (then**2).sum(axis=(0, 1)))
+        correlation = (now * then).sum(axis=(0, 1)) / np.where(power > 0, power, 1.0)
+        step = float(np.median(np.diff(few.times)[np.diff(few.times) > 0]))
+        self.noise_time_ = -step / np.log(np.clip(correlation, 1e-6, 1 - 1e-6))
+
+    # -- forecasting ----------------------------------------------------------------------
+
+    def _reads_logged_future(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
+        return "references" in self.layout_
+
+    def _forecast(
+        self,
+        query: Query,
+        *,
+        actions: str,
+        policy: Any,
+        return_std: bool,
+        n_samples: int | None,
+        rng: np.random.Generator,
+    ) -> Prediction:
+        means, variances = self._at(query)
+        prediction = Prediction(means.mean(axis=0))
+        if return_std or n_samples:
+            _, variance = mixture(means, variances, self.estimator_)
+            prediction.std = np.sqrt(variance) if return_std else None
+        if n_samples:
+            assert variances is not None  # mixture() has checked
+            prediction.samples = self._sample(query, means, variances, n_samples, rng)
+        return prediction
+
+    def _at(self, query: Query) -> tuple[Floats, Floats | None]:
+        """Means and variances (E, n, H, d_s) at every step of a query."""
+        horizons = np.where(query.known(), query.horizons, 0.0)
+        n, n_steps = horizons.shape
+        longest = horizons[np.argmax(query.lengths)]
+        splits = (
+            isinstance(self.estimator_, MLPEnsembleRegressor)
+            and isinstance(self.scaler_, BlockScaler)
+            and "references" not in self.layout_
+        )
+        if splits and ((horizons == longest) | ~query.known()).all():
+            return self._at_split_rows(query, np.arange(n), longest[None])
+        at_some = self._at_split_rows if splits else self._at_rows
+        per_chunk = max(_CHUNK_ROWS // n_steps, 1)
+        means, variances = [], []
+        for at in range(0, n, per_chunk):
+            some = np.arange(at, min(at + per_chunk, n))
+            mean, variance = at_some(query, some, horizons[some])
+            means.append(mean)
+            if variance is not None:
+                variances.append(variance)
+        joined = np.concatenate(variances, axis=1) if variances else None
+        return np.concatenate(means, axis=1), joined
+
+    def _at_rows(
+        self, query: Query, some: NDArray[np.intp], horizons: Floats
+    ) -> tuple[Floats, Floats | None]:
+        """Some starts at horizons (len(some), H) of their own, row by row."""
+        n_steps = horizons.shape[1]
+        start = query.rows[some]
+        rows = self.relabeler_.rows(query.ds, some, start, start)
+        rows = np.repeat(rows, n_steps, axis=0)
+        rows[:, self.layout_["horizon"]] = horizons.reshape(-1, 1)
+        if "references" in self.layout_:
+            references = query.ds.references
+            assert references is not None  # the relabeler has checked
+            ahead = query.future(references, steps=False)[some, 1:]
+            block = self.layout_["references"]
+            half = (block.stop - block.start) // 2
+            rows[:, block.start + half : block.stop] = ahead.reshape(-1, half)
+        means, variances = self._moments()(rows)
+        shape = (len(means), len(some), n_steps, means.shape[-1])
+        return means.reshape(shape), None if variances is None else variances.reshape(shape)
+
+    def _at_split_rows(
+        self, query: Query, some: NDArray[np.intp], horizons: Floats
+    ) -> tuple[Floats, Floats]:
+        """Some starts at horizons (len(some), H), or (1, H) for all: the first layer is split.
+
+        Its products with starts and with horizons are computed apart. So also where horizons
+        differ and nothing is saved: an episode gets the same bits alone as among others.
+        """
+        start = query.rows[some]
+        left = self.relabeler_.rows(query.ds, some, start, start)
+        right = np.repeat(left[:1], horizons.size, axis=0)
+        right[:, self.layout_["horizon"]] = horizons.reshape(-1, 1)
+        shape = (len(some), horizons.shape[1])
+        which = np.arange(horizons.size).reshape(horizons.shape)
+        columns = self.scaler_.block_columns_["horizon"]
+        others = np.setdiff1d(np.arange(self.estimator_.n_features_in_), columns)
+        outputs = self.estimator_.predictor().product(
+            self._scaled(left)[:, others],
+            self._scaled(right)[:, columns],
+            (others, columns),
+            (np.repeat(np.arange(len(some)), shape[1]), np.broadcast_to(which, shape).ravel()),
+        )
+        means, variances = (
+            part.reshape(len(part), *shape, -1) for part in self.estimator_.moments(outputs)
+        )
+        gate = self._gate(right).reshape(*horizons.shape, 1) if self._gated else 1.0
+        scale = gate * self.target_scale_
+        base = query.initial_states[some, None] if self.baseline == "state" else 0.0
+        return base + scale * means, scale**2 * variances
+
+    def _sample(
+        self,
+        query: Query,
+        means: Floats,
+        variances: Floats,
+        n_samples: int,
+        rng: np.random.Generator,
+    ) -> Floats:
+        """Whole trajectories: one member and one correlated noise path each."""
+        member = rng.permutation(np.arange(n_samples) % len(means))
+        shape = (n_samples, *means.shape[1:])
+        noise = rng.standard_normal(shape)
+        times = np.concatenate([query.initial_times[:, None], query.times], axis=1)
+        step = np.nan_to_num(np.diff(times, axis=1), nan=0.0)[..., None]
+        keep = np.exp(-step / self.noise_time_)
+        for k in range(1, shape[2]):
+            fresh = np.sqrt(1 - keep[:, k] ** 2) * noise[:, :, k]
+            noise[:, :, k] = keep[:, k] * noise[:, :, k - 1] + fresh
+        return means[member] + np.sqrt(variances[member]) * noise

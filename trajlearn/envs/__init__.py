@@ -1,0 +1,6 @@
+"""Simulated systems that episodes come from, one file a system."""
+
+from trajlearn.envs.base import Environment
+from trajlearn.envs.cartpole import Cartpole
+
+__all__ = ["Cartpole", "Environment"]

@@ -1,0 +1,37 @@
+"""Errors and warnings of the package.
+
+Errors are small subclasses of `ValueError`, so that ``except ValueError`` keeps working.
+"""
+
+__all__ = [
+    "DivergenceWarning",
+    "HorizonWarning",
+    "InvalidEpisodeError",
+    "MissingFieldError",
+    "MixedSamplingError",
+    "UnknownFileError",
+]
+
+
+class InvalidEpisodeError(ValueError):
+    """An episode has wrong shapes, non-finite values, unsorted times or no step at all."""
+
+
+class MissingFieldError(ValueError):
+    """A model needs a field (actions, params, references, ...) that the episodes lack."""
+
+
+class MixedSamplingError(ValueError):
+    """A one-step model without the time step as an input met episodes of unequal sampling."""
+
+
+class UnknownFileError(ValueError):
+    """A file is not one of this package's, was truncated or was changed by hand."""
+
+
+class DivergenceWarning(UserWarning):
+    """A forecast left every plausible range or became non-finite."""
+
+
+class HorizonWarning(UserWarning):
+    """A forecast reaches beyond the longest horizon seen in training."""

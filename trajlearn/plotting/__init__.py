@@ -1,0 +1,13 @@
+"""Pictures of forecasts and their errors, with matplotlib (``pip install "trajlearn[plot]"``).
+
+`plot_forecast` shows predicted against logged states, `plot_horizon_errors` how the error grows
+with the horizon, `plot_reward_table` how well rewards are predicted. Each draws into the axes it
+is given, or makes a figure, and returns the axes, so that titles, limits and legends can be
+changed afterwards.
+"""
+
+from trajlearn.plotting.errors import plot_horizon_errors
+from trajlearn.plotting.forecasts import plot_forecast
+from trajlearn.plotting.rewards import plot_reward_table
+
+__all__ = ["plot_forecast", "plot_horizon_errors", "plot_reward_table"]

@@ -1,0 +1,112 @@
+"""Losses of an ensemble's outputs and their gradients, written out.
+
+Both are a sum over members of a mean over rows and targets, so that a member learns as it would
+alone. Checked against autograd in the tests.
+"""
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+# standardised targets: start between a variance far below any fit and one near the data's own
+_INITIAL_BOUNDS = (-10.0, 0.5)
+_BOUND_PENALTY = 0.01
+
+
+class Loss(Protocol):
+    """What training asks of a loss."""
+
+    def gradient(self, out: Tensor, y: Tensor, weight: Tensor | None) -> Tensor:
+        """Gradient in the outputs (E, B, width); also fills those of the loss's own parameters."""
+
+    def value(self, out: Tensor, y: Tensor, weight: Tensor | None) -> Tensor:
+        """Loss of each member (E,)."""
+
+    def parameters(self) -> list[Tensor]:
+        """The loss's own trained parameters."""
+
+
+def _mean(terms: Tensor, weight: Tensor | None) -> Tensor:
+    return (terms if weight is None else terms * weight).mean(dim=(1, 2))
+
+
+class SquaredError:
+    """Mean squared error."""
+
+    def gradient(self, out: Tensor, y: Tensor, weight: Tensor | None) -> Tensor:
+        grad = out - y
+        grad *= 2.0 / (out.shape[1] * out.shape[2])
+        return grad if weight is None else grad.mul_(weight)
+
+    def value(self, out: Tensor, y: Tensor, weight: Tensor | None) -> Tensor:
+        return _mean((out - y) ** 2, weight)
+
+    def parameters(self) -> list[Tensor]:
+        return []
+
+
+class GaussianNLL:
+    r"""Gaussian negative log likelihood with trained variance bounds (beta-NLL for beta > 0).
+
+    The first half of the outputs is the mean m, the second a raw log variance that a smooth
+    clamp keeps between trained bounds (Chua et al. 2018). Each term
+    :math:`\tfrac12 (\log\sigma^2 + (m - y)^2 / \sigma^2)` is weighted by
+    :math:`\sigma^{2\beta}`, held constant (Seitzer et al. 2022).
+    """
+
+    def __init__(self, n_members: int, n_targets: int, beta: float, like: Tensor) -> None:
+        self.beta = beta
+        low, high = _INITIAL_BOUNDS
+        shape = (n_members, 1, n_targets)
+        self.min_logvar = torch.full(shape, low, dtype=like.dtype, device=like.device)
+        self.max_logvar = torch.full(shape, high, dtype=like.dtype, device=like.device)
+        for bound in self.parameters():
+            bound.grad = torch.zeros_like(bound)
+
+    def parameters(self) -> list[Tensor]:
+        return [self.min_logvar, self.max_logvar]
+
+    def split(self, out: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and bounded log variance (E, B, n_targets) each."""
+        mean, raw = out.chunk(2, dim=2)
+        return mean, bounded(raw, self.min_logvar, self.max_logvar)
+
+    def gradient(self, out: Tensor, y: Tensor, weight: Tensor | None) -> Tensor:
+        mean, raw = out.chunk(2, dim=2)
+        upper = self.max_logvar - softplus(self.max_logvar - raw)
+        logvar = self.min_logvar + softplus(upper - self.min_logvar)
+        precision = torch.exp(-logvar)
+        error = mean - y
+        scale = torch.exp(self.beta * logvar) / y[0].numel()
+        if weight is not None:
+            scale = scale * weight
+        grad = torch.empty_like(out)
+        torch.mul(error * precision, scale, out=grad[..., : y.shape[2]])
+        in_logvar = 0.5 * scale * (1.0 - error**2 * precision)
+        below_max = torch.sigmoid(self.max_logvar - raw)
+        above_min = torch.sigmoid(upper - self.min_logvar)
+        in_upper = in_logvar * above_min
+        torch.mul(in_upper, below_max, out=grad[..., y.shape[2] :])
+        # without a pull inwards the bounds would drift off and clamp nothing
+        pull = _BOUND_PENALTY / y.shape[2]
+        _fill(self.min_logvar, (in_logvar - in_upper).sum(1, keepdim=True) - pull)
+        _fill(self.max_logvar, (in_upper * (1.0 - below_max)).sum(1, keepdim=True) + pull)
+        return grad
+
+    def value(self, out: Tensor, y: Tensor, weight: Tensor | None) -> Tensor:
+        mean, logvar = self.split(out)
+        terms = 0.5 * (logvar + (mean - y) ** 2 * torch.exp(-logvar))
+        return _mean(terms, weight)
+
+
+def _fill(parameter: Tensor, gradient: Tensor) -> None:
+    assert parameter.grad is not None  # made with the parameter
+    parameter.grad.copy_(gradient)
+
+
+def bounded(raw: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Smooth clamp of a raw log variance."""
+    upper = high - softplus(high - raw)
+    return low + softplus(upper - low)

@@ -1,0 +1,499 @@
+"""Ensembles of multilayer perceptrons, deterministic or Gaussian, trained as one network."""
+
+from collections.abc import Iterator, Sequence
+from numbers import Integral, Real
+from typing import Any, ClassVar, Literal, Self, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.utils import Tags, check_random_state
+from sklearn.utils.validation import (
+    _check_sample_weight,
+    check_is_fitted,
+    validate_data,
+)
+
+from trajlearn._sklearn import Interval, StrOptions, fit_context
+from trajlearn.regressors._batches import (
+    Batch,
+    Draw,
+    ToTensors,
+    checked_draw,
+    row_batches,
+    stream_batches,
+)
+from trajlearn.regressors._device import find_device
+from trajlearn.regressors._ensemble import Ensemble
+from trajlearn.regressors._network import ACTIVATIONS
+from trajlearn.regressors._prediction import Predictor, bounded, mixture
+from trajlearn.regressors._samples import (
+    Rows,
+    bootstrap_counts,
+    check_groups,
+    held_out,
+    standardisation,
+)
+from trajlearn.regressors._training import Settings, Validation, default_steps
+
+__all__ = ["MLPEnsembleRegressor"]
+
+Floats = NDArray[np.float64]
+
+# rows of a stream that fix the scale of the targets and the residual variance
+_REFERENCE_ROWS = 16_384
+# training that ends further than this from the targets, in units of their spread, has failed
+_DIVERGED = 10.0
+
+
+class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
+    """Ensemble of E multilayer perceptrons, one batched network, for one or several targets.
+
+    Targets are standardised inside; inputs are taken as they are, so scale them before (the
+    dynamics estimators do; elsewhere put a `StandardScaler` in front).
+
+    Parameters
+    ----------
+    hidden_layer_sizes : sequence of int, default=(250, 250)
+    n_members : int, default=1
+        Networks E with their own initial weights and order of rows.
+    probabilistic : bool, default=False
+        Predict a mean and a variance for every row and train on the Gaussian likelihood.
+        Otherwise train on the squared error; the variance is then that of the training residuals.
+    activation : {"silu", "relu", "tanh"}, default="silu"
+    learning_rate : float, default=3e-3
+        Peak rate of the schedule.
+    schedule : {"one-cycle", "constant"}, default="one-cycle"
+        "one-cycle": a tenth of the steps warm-up, then a cosine down to zero.
+    batch_size : int, default=256
+        With no more different rows than this, every step sees all of them. For each member.
+    max_steps : int or None, default=None
+        Gradient steps. None: ``15 * rows ** 0.55``, between 100 and 4,000.
+    max_epochs : int or None, default=None
+        Budget in passes over the rows instead of steps; not for streams.
+    weight_decay : float, default=0.0
+        Decoupled (AdamW), on weights only.
+    bootstrap : {False, "row", "group"}, default=False
+        Train each member on rows, or on whole groups, drawn with replacement.
+    early_stopping : bool, default=False
+        Hold out `validation_fraction` of the rows (of the groups, where `groups` is given) and
+        keep each member's best weights there.
+    validation_fraction : float, default=0.1
+    patience : int, default=10
+        Evaluations (a hundredth of the steps apart) without improvement in any member before
+        training ends.
+    nll_beta : float, default=0.5
+        Exponent of beta-NLL for `probabilistic`; 0 is the plain likelihood, 1 weights the mean
+        as the squared error does.
+    device : str, default="cpu"
+    warm_start : bool, default=False
+        Go on from the weights of the last fit.
+    random_state : int, RandomState or None, default=None
+    verbose : int, default=0
+        1 shows a progress bar.
+
+    Attributes
+    ----------
+    n_features_in_ : int
+    n_steps_ : int
+        Gradient steps that the last fit took.
+    loss_curve_ : ndarray of shape (about 100, E)
+        Training loss on standardised targets at regular steps.
+    validation_loss_curve_ : ndarray of shape (evaluations, E)
+    residual_std_ : ndarray of shape (E, n_targets)
+        Standard deviation of the training residuals, in target units.
+    coefs_, intercepts_ : list of ndarray of shape (E, in, out), (E, 1, out)
+    logvar_bounds_ : ndarray of shape (2, E, 1, n_targets)
+        Trained bounds of the log variance of standardised targets, if `probabilistic`.
+    target_mean_, target_scale_ : ndarray of shape (n_targets,)
+
+    See Also
+    --------
+    GPRegressor : Gaussian processes, for up to a few thousand rows.
+
+    References
+    ----------
+    K. Chua et al., "Deep Reinforcement Learning in a Handful of Trials using Probabilistic
+    Dynamics Models", NeurIPS 2018 (trained variance bounds).
+    M. Seitzer et al., "On the Pitfalls of Heteroscedastic Uncertainty Estimation with
+    Probabilistic Neural Networks", ICLR 2022 (beta-NLL).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from trajlearn import MLPEnsembleRegressor
+    >>> X = np.linspace(-1, 1, 200)[:, None]
+    >>> model = MLPEnsembleRegressor(hidden_layer_sizes=(32, 32), random_state=0)
+    >>> model.fit(X, np.sin(3 * X[:, 0])).score(X, np.sin(3 * X[:, 0])) > 0.99
+    True
+    """
+
+    coefs_: list[NDArray[np.float32]]
+    intercepts_: list[NDArray[np.float32]]
+    logvar_bounds_: NDArray[np.float32]
+    _moments: list[NDArray[np.float32]]
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        "hidden_layer_sizes": ["array-like"],
+        "n_members": [Interval(Integral, 1, None, closed="left")],
+        "probabilistic": ["boolean"],
+        "activation": [StrOptions(set(ACTIVATIONS))],
+        "learning_rate": [Interval(Real, 0, None, closed="neither")],
+        "schedule": [StrOptions({"one-cycle", "constant"})],
+        "batch_size": [Interval(Integral, 1, None, closed="left")],
+        "max_steps": [Interval(Integral, 1, None, closed="left"), None],
+        "max_epochs": [Interval(Integral, 1, None, closed="left"), None],
+        "weight_decay": [Interval(Real, 0, None, closed="left")],
+        "bootstrap": [StrOptions({"row", "group"}), "boolean"],
+        "early_stopping": ["boolean"],
+        "validation_fraction": [Interval(Real, 0, 1, closed="neither")],
+        "patience": [Interval(Integral, 1, None, closed="left")],
+        "nll_beta": [Interval(Real, 0, 1, closed="both")],
+        "device": [str],
+        "warm_start": ["boolean"],
+        "random_state": ["random_state"],
+        "verbose": ["verbose"],
+    }
+
+    def __init__(
+        self,
+        *,
+        hidden_layer_sizes: Sequence[int] = (250, 250),
+        n_members: int = 1,
+        probabilistic: bool = False,
+        activation: str = "silu",
+        learning_rate: float = 3e-3,
+        schedule: str = "one-cycle",
+        batch_size: int = 256,
+        max_steps: int | None = None,
+        max_epochs: int | None = None,
+        weight_decay: float = 0.0,
+        bootstrap: Literal[False, "row", "group"] = False,
+        early_stopping: bool = False,
+        validation_fraction: float = 0.1,
+        patience: int = 10,
+        nll_beta: float = 0.5,
+        device: str = "cpu",
+        warm_start: bool = False,
+        random_state: Any = None,
+        verbose: int = 0,
+    ) -> None:
+        self.hidden_layer_sizes = hidden_layer_sizes
+        self.n_members = n_members
+        self.probabilistic = probabilistic
+        self.activation = activation
+        self.learning_rate = learning_rate
+        self.schedule = schedule
+        self.batch_size = batch_size
+        self.max_steps = max_steps
+        self.max_epochs = max_epochs
+        self.weight_decay = weight_decay
+        self.bootstrap = bootstrap
+        self.early_stopping = early_stopping
+        self.validation_fraction = validation_fraction
+        self.patience = patience
+        self.nll_beta = nll_beta
+        self.device = device
+        self.warm_start = warm_start
+        self.random_state = random_state
+        self.verbose = verbose
+
+    def __sklearn_tags__(self) -> Tags:
+        tags = super().__sklearn_tags__()
+        tags.target_tags.multi_output = True
+        return tags
+
+    @fit_context(prefer_skip_nested_validation=True)
+    def fit(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        *,
+        sample_weight: ArrayLike | None = None,
+        groups: ArrayLike | None = None,
+    ) -> Self:
+        """Train on rows.
+
+        Parameters
+        ----------
+        X : array-like of shape (n, n_features)
+        y : array-like of shape (n,) or (n, n_targets)
+        sample_weight : array-like of shape (n,), optional
+            A row of weight k counts as k rows: exactly so up to `batch_size` different rows;
+            with more, rows are drawn in proportion.
+        groups : array-like of shape (n,), optional
+            Labels (such as the episode of a row) that early stopping and the group bootstrap
+            keep together.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            For invalid or non-finite input, weights that are negative or all zero, groups that
+            are needed and missing, an absent device, training that diverges.
+        """
+        rows = self._validated(X, y, sample_weight, groups, reset=not self._goes_on())
+        rng = np.random.default_rng(self._seed())
+        validation = None
+        if self.early_stopping:
+            rows, validation = held_out(rows, self.validation_fraction, rng)
+        self._set_target_scale(rows, keep=self._goes_on())
+        counts = None
+        if self.bootstrap:
+            by = rows.groups if self.bootstrap == "group" else None
+            counts = bootstrap_counts(len(rows), by, self.n_members, rng)
+        to_tensors = self._to_tensors()
+        batches = row_batches(rows, counts, to_tensors, self.n_members, self.batch_size, rng)
+        self._train(batches, self._budget(len(rows)), rng, validation=validation)
+        self._set_residuals(rows, limit=_DIVERGED)
+        return self
+
+    @fit_context(prefer_skip_nested_validation=True)
+    def fit_stream(
+        self, draw: Draw, *, random_state: Any = None, n_rows: int | None = None
+    ) -> Self:
+        """Train on fresh rows at every step.
+
+        Parameters
+        ----------
+        draw : callable
+            ``draw(n, rng) -> (X, y, weight)``: n fresh rows, their targets and None or their
+            weights in the loss.
+        random_state : int, RandomState or None
+            None takes the constructor's.
+        n_rows : int, optional
+            How many different rows there are, for ``max_steps=None``.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            As in `fit`; for draws of other shapes; with `early_stopping`, `bootstrap` or
+            `max_epochs`, which need fixed rows.
+        """
+        self._refuse("early_stopping", "bootstrap", "max_epochs", why="fixed rows, not a stream")
+        rng = np.random.default_rng(self._seed(random_state))
+        reference = checked_draw(draw, _REFERENCE_ROWS, rng)
+        rows = self._validated(*reference, reset=not self._goes_on())
+        self._set_target_scale(rows, keep=self._goes_on())
+        widths, to_tensors = (self.n_features_in_, rows.y.shape[1]), self._to_tensors()
+
+        def pool(n: int) -> Batch:
+            return to_tensors(*checked_draw(draw, n, rng, widths))
+
+        batches = stream_batches(pool, self.n_members, self.batch_size)
+        self._train(batches, self._budget(n_rows or 10**9), rng)
+        self._set_residuals(rows, limit=_DIVERGED)
+        return self
+
+    @fit_context(prefer_skip_nested_validation=True)
+    def partial_fit(
+        self, X: ArrayLike, y: ArrayLike, *, sample_weight: ArrayLike | None = None
+    ) -> Self:
+        """One pass over the rows at the constant rate, from the weights and moments so far.
+
+        The first call fixes the scale of the targets.
+
+        Parameters
+        ----------
+        X : array-like of shape (n, n_features)
+        y : array-like of shape (n,) or (n, n_targets)
+        sample_weight : array-like of shape (n,), optional
+            As in `fit`.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        ValueError
+            As in `fit`; with `early_stopping` or `bootstrap`, which need all rows at once; for
+            another number of features or targets than at first.
+        """
+        self._refuse("early_stopping", "bootstrap", why="all rows at once, in fit")
+        first = not hasattr(self, "coefs_")
+        rows = self._validated(X, y, sample_weight, reset=first)
+        # the same seed must not give every pass the same order of rows
+        passed = 0 if first else int(self._moments[0])
+        rng = np.random.default_rng([*self._seed(), passed])
+        self._set_target_scale(rows, keep=not first)
+        batches = row_batches(rows, None, self._to_tensors(), self.n_members, self.batch_size, rng)
+        n_steps = -(-len(rows) // self.batch_size)
+        self._train(batches, n_steps, rng, go_on=not first, schedule="constant")
+        self._set_residuals(rows, limit=np.inf)
+        return self
+
+    def _validated(
+        self, X: Any, y: Any, sample_weight: Any, groups: Any = None, *, reset: bool
+    ) -> Rows:
+        """Rows of positive weight, repeated ones merged if all fit into one batch."""
+        X, y = validate_data(
+            self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, reset=reset
+        )
+        y = np.asarray(y, dtype=np.float64)
+        columns = y[:, None] if y.ndim == 1 else y
+        if not reset and columns.shape[1] != len(self.target_mean_):
+            raise ValueError(f"y has {columns.shape[1]} targets; fitted: {len(self.target_mean_)}.")
+        self._y_ndim = y.ndim
+        if sample_weight is not None:
+            sample_weight = _check_sample_weight(sample_weight, X, dtype=np.float64)
+        if self.bootstrap == "group" and groups is None:
+            raise ValueError('bootstrap="group" needs groups= in fit, one label a row.')
+        used = groups is not None and (self.early_stopping or self.bootstrap == "group")
+        groups = check_groups(groups, len(X)) if used else None
+        return Rows(X, columns, sample_weight, groups).without_weightless().merged(self.batch_size)
+
+    def _seed(self, random_state: Any = None) -> list[int]:
+        state = self.random_state if random_state is None else random_state
+        return check_random_state(state).randint(2**31, size=4).tolist()
+
+    def _goes_on(self) -> bool:
+        return self.warm_start and hasattr(self, "coefs_")
+
+    def _refuse(self, *names: str, why: str) -> None:
+        for name in names:
+            if getattr(self, name):
+                raise ValueError(f"{name}={getattr(self, name)!r} needs {why}.")
+
+    def _budget(self, n_rows: int) -> int:
+        if self.max_epochs is not None:
+            return self.max_epochs * -(-n_rows // self.batch_size)
+        if self.max_steps is not None:
+            return self.max_steps
+        return default_steps(n_rows)
+
+    def _set_target_scale(self, rows: Rows, *, keep: bool) -> None:
+        if not keep:
+            self.target_mean_, self.target_scale_ = standardisation(rows.y, rows.weight)
+
+    def _to_tensors(self) -> ToTensors:
+        return ToTensors(self.target_mean_, self.target_scale_, find_device(self.device))
+
+    def _train(
+        self,
+        batches: Iterator[Batch],
+        n_steps: int,
+        rng: np.random.Generator,
+        *,
+        validation: Rows | None = None,
+        go_on: bool = False,
+        schedule: str | None = None,
+    ) -> None:
+        ensemble = Ensemble(
+            self.n_features_in_,
+            len(self.target_mean_),
+            self.hidden_layer_sizes,
+            self.n_members,
+            self.activation,
+            nll_beta=self.nll_beta if self.probabilistic else None,
+            weight_decay=self.weight_decay,
+            device=find_device(self.device),
+            seed=int(rng.integers(2**62)),
+        )
+        if go_on or self._goes_on():
+            moments = self._moments if go_on else None
+            ensemble.resume(self.coefs_, self.intercepts_, self.logvar_bounds_, moments)
+        schedule = schedule or self.schedule
+        settings = Settings(n_steps, self.learning_rate, schedule, verbose=bool(self.verbose))
+        held = None
+        if validation is not None:
+            tensors = self._to_tensors()(validation.X, validation.y, validation.weight)
+            held = Validation(*tensors, self.patience)
+        curves = ensemble.train(batches, settings, held)
+        self.n_steps_, self.loss_curve_, self.validation_loss_curve_ = curves
+        self.coefs_, self.intercepts_ = ensemble.weights(), ensemble.biases()
+        self.logvar_bounds_ = ensemble.bounds()
+        self._moments = ensemble.optimizer.moments()
+
+    def _set_residuals(self, rows: Rows, *, limit: float) -> None:
+        """Spread of the residuals on (at most some thousand of) the training rows.
+
+        Raises, and leaves the estimator unfitted, if it exceeds `limit` times the targets' own.
+        """
+        rows = rows.thinned(_REFERENCE_ROWS)
+        means = self.predictor()(rows.X)[..., : rows.y.shape[1]]
+        squared = np.average((means - rows.y) ** 2, axis=1, weights=rows.weight)
+        self.residual_std_ = np.sqrt(squared)
+        worst = float((self.residual_std_ / self.target_scale_).max())
+        if not (worst < limit and np.isfinite(self.loss_curve_).all()):
+            del self.coefs_
+            raise ValueError(
+                f"training diverged (the residuals are {worst:.3g} times the spread of the "
+                f"targets): scale the inputs, or lower learning_rate (now {self.learning_rate:g})."
+            )
+
+    def predictor(self) -> Predictor:
+        """Fast evaluation without validation, for roll-outs and planning.
+
+        Returns
+        -------
+        Predictor
+            ``predictor(X)`` gives means (E, n, n_targets), followed on the last axis by raw log
+            variances if `probabilistic`; see `moments`.
+        """
+        scale, shift = self.target_scale_, self.target_mean_
+        if self.probabilistic:
+            scale = np.concatenate([scale, np.ones_like(scale)])
+            shift = np.concatenate([shift, np.zeros_like(shift)])
+        return Predictor(
+            self.coefs_,
+            self.intercepts_,
+            self.activation,
+            device=find_device(self.device),
+            output_scale=scale,
+            output_shift=shift,
+        )
+
+    def moments(self, outputs: Floats) -> tuple[Floats, Floats]:
+        """Mean and variance of each member (E, n, n_targets) from a predictor's outputs."""
+        n_targets = len(self.target_mean_)
+        mean = outputs[..., :n_targets]
+        if not self.probabilistic:
+            variance = np.broadcast_to(self.residual_std_[:, None, :] ** 2, mean.shape)
+            return mean, variance
+        low, high = self.logvar_bounds_.astype(np.float64)
+        return mean, np.exp(bounded(outputs[..., n_targets:], low, high)) * self.target_scale_**2
+
+    def predict_members(self, X: ArrayLike) -> Floats:
+        """Mean of each member (E, n, n_targets).
+
+        Parameters
+        ----------
+        X : array-like of shape (n, n_features)
+        """
+        check_is_fitted(self, "coefs_")
+        rows: Floats = validate_data(self, X, reset=False, dtype=np.float64)
+        return self.predictor()(rows)[..., : len(self.target_mean_)]
+
+    @overload
+    def predict(self, X: ArrayLike, return_std: Literal[False] = False) -> Floats: ...
+    @overload
+    def predict(self, X: ArrayLike, return_std: Literal[True]) -> tuple[Floats, Floats]: ...
+    def predict(self, X: ArrayLike, return_std: bool = False) -> Floats | tuple[Floats, Floats]:
+        """Mean of the members.
+
+        Parameters
+        ----------
+        X : array-like of shape (n, n_features)
+        return_std : bool, default=False
+            Also return the standard deviation of the mixture of all members, in target units:
+            the mean of their variances plus the variance of their means.
+
+        Returns
+        -------
+        mean : ndarray of shape (n,) or (n, n_targets)
+        std : ndarray of the same shape, if asked for
+        """
+        check_is_fitted(self, "coefs_")
+        rows: Floats = validate_data(self, X, reset=False, dtype=np.float64)
+        mean, variance = mixture(*self.moments(self.predictor()(rows)))
+        if self._y_ndim == 1:
+            mean, variance = mean[:, 0], variance[:, 0]
+        return (mean, np.sqrt(variance)) if return_std else mean

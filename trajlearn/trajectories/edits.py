@@ -1,0 +1,216 @@
+"""New datasets from old ones: cut, select, add noise, join."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+from numbers import Integral, Real
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from sklearn.utils import check_random_state, check_scalar
+
+from trajlearn.exceptions import InvalidEpisodeError
+from trajlearn.trajectories._arrays import unique_ids
+from trajlearn.trajectories._columns import Columns, _offsets, runs
+from trajlearn.trajectories._pieces import cut, like, pieces
+from trajlearn.trajectories.dataset import TrajectoryDataset
+from trajlearn.trajectories.resampling import decimate, resample
+
+__all__ = [
+    "add_noise",
+    "concatenate",
+    "decimate",
+    "resample",
+    "select_states",
+    "truncate",
+    "window",
+]
+
+
+def truncate(ds: TrajectoryDataset, max_steps: int) -> TrajectoryDataset:
+    """At most the first `max_steps` steps of each episode.
+
+    An episode cut short is no longer `terminated`; everything else is kept.
+
+    Examples
+    --------
+    >>> ds = TrajectoryDataset.from_arrays([[[0.0]] * 4, [[0.0]] * 9])
+    >>> truncate(ds, 5).lengths
+    array([3, 5])
+    """
+    check_scalar(max_steps, "max_steps", Integral, min_val=1)
+    episode = np.arange(len(ds))
+    steps = np.minimum(ds.lengths, max_steps)
+    return like(ds, cut(ds._columns, episode, np.zeros_like(episode), steps))
+
+
+def window(ds: TrajectoryDataset, length: int, *, stride: int | None = None) -> TrajectoryDataset:
+    """Windows of `length` steps (``length + 1`` states), every `stride` steps.
+
+    With the default stride (`length`) they tile the episode; neighbours share one state. Times
+    and `time_origin` stay as logged. A tail shorter than `length` is left out; only the window
+    that reaches the end of a terminated episode is `terminated`. Windows are called
+    ``"<id>:<start>"``. Where the dataset has no `group`, the windows get the id of their episode
+    as group, so that group splits never part them.
+
+    Raises
+    ------
+    InvalidEpisodeError
+        If no episode has `length` steps.
+
+    Examples
+    --------
+    >>> ds = TrajectoryDataset.from_arrays([[[0.0]] * 4, [[0.0]] * 9], ids=["a", "b"])
+    >>> window(ds, 3).ids.tolist()
+    ['a:0', 'b:0', 'b:3']
+    """
+    check_scalar(length, "length", Integral, min_val=1)
+    stride = length if stride is None else stride
+    check_scalar(stride, "stride", Integral, min_val=1)
+    counts = np.maximum((ds.lengths - length) // stride + 1, 0)
+    if not counts.any():
+        raise InvalidEpisodeError(
+            f"no episode has {length} steps (the longest has {ds.lengths.max()}): ask for shorter "
+            "windows."
+        )
+    episode = np.repeat(np.arange(len(ds)), counts)
+    start = runs(np.zeros(len(ds), dtype=np.intp), counts, stride)
+    return like(ds, pieces(ds._columns, episode, start, np.full_like(start, length)))
+
+
+def select_states(ds: TrajectoryDataset, names: Sequence[str]) -> TrajectoryDataset:
+    """Keep the named state columns, in that order.
+
+    Raises
+    ------
+    ValueError
+        If a name is unknown or repeated, or none is given.
+
+    Examples
+    --------
+    >>> ds = TrajectoryDataset.from_arrays([[[1.0, 2.0]] * 3], state_names=["x", "v"])
+    >>> select_states(ds, ["v"]).states.ravel()
+    array([2., 2., 2.])
+    """
+    chosen = [names] if isinstance(names, str) else list(names)
+    for name in chosen:
+        if name not in ds.state_names:
+            close = get_close_matches(str(name), ds.state_names, n=1)
+            hint = f" Did you mean {close[0]!r}?" if close else ""
+            raise ValueError(
+                f"there is no state called {name!r}; the states are {list(ds.state_names)}.{hint}"
+            )
+    if not chosen or len(set(chosen)) < len(chosen):
+        raise ValueError(f"names = {chosen}: give at least one state, and each once.")
+    index = [ds.state_names.index(name) for name in chosen]
+    columns = replace(ds._columns, states=np.ascontiguousarray(ds.states[:, index]))
+    return TrajectoryDataset._of(columns.freeze(), ds._names | {"states": tuple(chosen)})
+
+
+def add_noise(
+    ds: TrajectoryDataset,
+    fraction: float,
+    *,
+    of: Literal["std", "range"] = "std",
+    random_state: Any = None,
+) -> TrajectoryDataset:
+    """Add independent Gaussian measurement noise to every state, and to nothing else.
+
+    Parameters
+    ----------
+    ds : TrajectoryDataset
+    fraction : float
+        Standard deviation of the noise as a fraction of each state column's spread over the
+        whole dataset.
+    of : {"std", "range"}, default="std"
+        What the spread is: standard deviation, or maximum minus minimum.
+    random_state : int, RandomState instance or None
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> ds = TrajectoryDataset.from_arrays([np.arange(1000.0)[:, None]])
+    >>> noisy = add_noise(ds, 0.1, of="range", random_state=0)
+    >>> print(f"{(noisy.states - ds.states).std():.0f}")
+    99
+    """
+    check_scalar(fraction, "fraction", Real, min_val=0)
+    if not np.isfinite(fraction):
+        raise ValueError(f"fraction = {fraction} must be finite.")
+    if of not in ("std", "range"):
+        raise ValueError(f"of = {of!r}: choose 'std' or 'range'.")
+    spread = ds.states.std(axis=0) if of == "std" else np.ptp(ds.states, axis=0)
+    noise = check_random_state(random_state).standard_normal(ds.states.shape)
+    return like(ds, replace(ds._columns, states=ds.states + fraction * spread * noise))
+
+
+def concatenate(ds: TrajectoryDataset, *others: TrajectoryDataset) -> TrajectoryDataset:
+    """Episodes of several datasets, one after the other.
+
+    Ids are kept if they still tell all episodes apart; else the episodes are numbered.
+
+    Raises
+    ------
+    ValueError
+        If the datasets have not the same fields, column names, context and kind of group.
+
+    Examples
+    --------
+    >>> ds = TrajectoryDataset.from_arrays([[[0.0]] * 4, [[0.0]] * 9])
+    >>> concatenate(ds, ds).ids
+    array([0, 1, 2, 3])
+    """
+    for position, other in enumerate(others, start=2):
+        if not isinstance(other, TrajectoryDataset):
+            raise TypeError(f"concatenate joins datasets, got {type(other).__name__}.")
+        mine, theirs = _fields(ds), _fields(other)
+        for field in mine:
+            if mine[field] != theirs[field]:
+                raise ValueError(
+                    f"the datasets differ in {field}: {mine[field]} in the first, {theirs[field]} "
+                    f"in number {position}. Give them the same fields and names."
+                )
+    parts = [item._columns for item in (ds, *others)]
+    per_step = any(part.params_per_step for part in parts)
+    joined: dict[str, Any] = {"params_per_step": per_step}
+    for name in (
+        "states",
+        "times",
+        "references",
+        "actions",
+        "rewards",
+        "terminated",
+        "time_origin",
+        "group",
+    ):
+        if getattr(parts[0], name) is not None:
+            joined[name] = np.concatenate([getattr(part, name) for part in parts])
+    if parts[0].params is not None:
+        joined["params"] = np.concatenate(
+            [item.step_params if per_step else item.params for item in (ds, *others)]
+        )
+    joined["offsets"] = _offsets(np.concatenate([part.lengths + 1 for part in parts]))
+    ids = [label for part in parts for label in part.ids.tolist()]
+    if len({type(label) for label in ids}) > 1:
+        ids = [str(label) for label in ids]
+    joined["ids"] = np.array(unique_ids(ids))
+    joined["context"] = {
+        key: np.concatenate([part.context[key] for part in parts]) for key in parts[0].context
+    }
+    return like(ds, Columns(**joined))
+
+
+def _fields(ds: TrajectoryDataset) -> dict[str, Any]:
+    return {
+        **{f"{field[:-1]}_names": list(names) for field, names in ds._names.items()},
+        "rewards": "given" if ds.rewards is not None else "missing",
+        "context": {key: _kind(values) for key, values in ds.context.items()},
+        "group": None if ds.group is None else _kind(ds.group),
+    }
+
+
+def _kind(values: NDArray[Any]) -> str:
+    return {"b": "booleans", "i": "whole numbers", "u": "whole numbers"}.get(
+        values.dtype.kind, "text"
+    )
