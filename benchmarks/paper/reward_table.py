@@ -117,7 +117,7 @@ CANDIDATES: dict[str, list[Config]] = {
     "NN": [{"estimator__weight_decay": decay} for decay in (1e-2, 1e-1)],
     "D": [{"estimator__batch_size": size} for size in (128, 256)],
     "C": [{"estimator__batch_size": size} for size in (128, 256)],
-    "T": [{"gate": gate} for gate in (0.05, None)],
+    "T": [{"gate": gate} for gate in (0.05, 0.2)],
 }
 
 
@@ -208,7 +208,7 @@ def chosen_configs(
     """
     rows = variants(family)
     if settings != "tuned":
-        return dict.fromkeys(rows, {}), 0.0
+        return {row: {} for row in rows}, 0.0
     began = time.perf_counter()
     order = np.random.default_rng(seed).permutation(len(train))
     held, kept = train[order[: len(train) // 5]], train[order[len(train) // 5 :]]
@@ -287,6 +287,31 @@ def markdown(frame: pd.DataFrame) -> str:
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for _, line in frame.iterrows():
         lines.append("| " + " | ".join(number(line[name]) for name in head) + " |")
+    return "\n".join(lines)
+
+
+def brief(task: str, records: list[dict[str, Any]]) -> str:
+    """Compact Markdown table for the README: one line a method, one column a kind of settings."""
+    frame = table(task, records).set_index(["settings", "method"])
+
+    def entry(settings: str, method: str) -> str:
+        if (settings, method) not in frame.index:
+            return ""
+        line = frame.loc[(settings, method)]
+        return f"{line['MSE']:.2g} ± {line['MSE std over seeds']:.1g}"
+
+    lines = [
+        "| method | paper prints | its settings, actions aligned | tuned | library defaults |",
+        "|---|---|---|---|---|",
+    ]
+    for method in MAPPING:
+        if method == "constant":
+            cells = ["", "", "", entry("-", method)]
+        else:
+            printed = PAPER[task].get(method)
+            cells = ["" if printed is None else f"{printed[0]:g}"]
+            cells += [entry(settings, method) for settings in ("paper", "tuned", "default")]
+        lines.append(f"| {method} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 

@@ -55,6 +55,7 @@ def measure(
         {
             **labels,
             "case": case.name,
+            "base": case is cases[0],
             "goal": case.goal,
             "rounds": rounds,
             "calls_a_round": repeat,
@@ -68,8 +69,9 @@ def measure(
 
 
 def spread(rows: Sequence[dict[str, Any]]) -> float:
-    """Median over the rows of the interquartile range of the ratio, as a share of the ratio."""
-    return float(np.median([np.ptp(row["ratio_quartiles"]) / row["ratio"] for row in rows]))
+    """Median over the compared cases of the interquartile range of the ratio, as a share of it."""
+    shares = [np.ptp(row["ratio_quartiles"]) / row["ratio"] for row in rows if not row["base"]]
+    return float(np.median(shares))
 
 
 def _time(run: Callable[[], object], repeats: int) -> float:

@@ -73,7 +73,7 @@ def run(mode: str, effort: Effort, *, mbrl: bool = False) -> dict[str, Any]:
     settings: dict[str, Any] = {"sizes": SIZES, **asdict(effort)}
     if mbrl:
         settings["mbrl"], others = _mbrl.run(SIZES, asdict(effort))
-        rows += others
+        rows = sorted(rows + others, key=lambda row: (row["batch_size"], row["n_members"]))
     return result(NAME, mode, rows, settings)
 
 

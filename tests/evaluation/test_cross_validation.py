@@ -1,6 +1,8 @@
+import joblib
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 from numpy.testing import assert_allclose
 from sklearn.base import BaseEstimator
 from sklearn.linear_model import LinearRegression
@@ -120,6 +122,15 @@ def test_short_episodes_count_where_they_reach(persistence, make_ramps):
     assert table["median"].isna().tolist() == [False] * 5 + [True]
 
 
+def test_nothing_is_forecast_beyond_the_longest_horizon(persistence, make_ramps):
+    log = []
+    cross_validate_horizons(
+        Splits(persistence(), log), make_ramps(np.ones(4), [9, 2, 9, 9]), [1, 4], cv=KFold(2)
+    )
+    assert [tested.lengths.tolist() for _, tested in log] == [[4, 2], [4, 4]]
+    assert [trained.lengths.tolist() for trained, _ in log] == [[9, 9], [9, 2]]
+
+
 def test_diverged_forecasts_are_counted_not_dropped(persistence, make_ramps):
     ds = make_ramps(np.ones(4), [2, 6, 6, 6])
     table = cross_validate_horizons(persistence(diverges_at=3), ds, [2, 6], cv=KFold(2))
@@ -140,6 +151,28 @@ def test_workers_give_the_same_numbers(decays):
     serial = cross_validate_horizons(tiny_net(), decays, [1, 10, 20], cv=2)
     parallel = cross_validate_horizons(tiny_net(), decays, [1, 10, 20], cv=2, n_jobs=2)
     pd.testing.assert_frame_equal(parallel, serial, check_exact=True)
+
+
+def test_workers_keep_to_one_thread(persistence, make_ramps):
+    seen = []
+
+    class Watch(Splits):
+        def fit(self, ds):
+            seen.append(torch.get_num_threads())
+            return super().fit(ds)
+
+    ds = make_ramps(np.ones(4), [3] * 4)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        cross_validate_horizons(Watch(persistence(), []), ds, 1, cv=2)
+        assert seen == [2, 2]
+        with joblib.parallel_config(backend="threading"):
+            cross_validate_horizons(Watch(persistence(), []), ds, 1, cv=2, n_jobs=2)
+        assert seen[2:] == [1, 1]
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_progress_is_shown_on_request(persistence, make_ramps, capsys):

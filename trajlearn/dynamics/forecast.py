@@ -226,6 +226,7 @@ class Forecast:
         episode = np.arange(len(self)) if self.episode is None else self.episode
         steps = self.start[:, None] + self.horizons[None, :]
         known = steps <= truth.lengths[episode][:, None]
+        known &= np.arange(len(self.horizons)) < self.lengths[:, None]
         rows = truth.offsets[:-1][episode][:, None] + np.where(known, steps, 0)
         low, high = self.state_range
         width = np.where(high > low, high - low, 1.0)

@@ -1,8 +1,9 @@
 """What all simulated systems share: seeded episodes, batched roll-outs, early ends."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from numbers import Integral
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.random import Generator, RandomState
@@ -27,6 +28,27 @@ class _Episode(NamedTuple):
     actions: NDArray[np.float64]
     params: NDArray[np.float64]
     terminated: bool
+
+
+class _Simulator(Protocol):
+    """What advances the episodes of one batch: see ``Environment._simulator``."""
+
+    def __call__(
+        self,
+        rows: NDArray[np.intp],
+        states: NDArray[np.float64],
+        actions: NDArray[np.float64],
+        /,
+    ) -> NDArray[np.float64]: ...
+
+
+class _SimulationError(ValueError):
+    """A step that went wrong: in which row of the states, and how ("... left the bounds")."""
+
+    def __init__(self, row: int, reason: str) -> None:
+        super().__init__(f"the simulation of row {row} of states {reason}.")
+        self.row = row
+        self.reason = reason
 
 
 class Environment(ABC):
@@ -88,6 +110,15 @@ class Environment(ABC):
         self, states: NDArray[np.float64], actions: NDArray[np.float64]
     ) -> NDArray[np.float64]:
         """Advance checked states (n, d_s) by one step under clipped actions (n, d_a)."""
+
+    def _simulator(self, starts: NDArray[np.float64]) -> _Simulator:
+        """Start episodes from ``starts`` and return what advances them.
+
+        ``advance(rows, states, actions)`` gives the next states of the episodes ``rows``, which
+        are in ``states`` now; it may raise ``_SimulationError``. A system whose simulator knows
+        more than the state (an angle beyond a turn, a solver's warm start) keeps it there.
+        """
+        return lambda rows, states, actions: self._step(states, actions)
 
     def is_terminal(self, states: ArrayLike) -> NDArray[np.bool_]:
         """Whether an episode ends on stepping into ``states`` (..., d_s), shape (...)."""
@@ -157,7 +188,12 @@ class Environment(ABC):
         return np.stack([self._draw_params(stream.params) for stream in streams])
 
     def collect(
-        self, n_episodes: int, length: int, random_state: int | RandomState | None = None
+        self,
+        n_episodes: int,
+        length: int,
+        random_state: int | RandomState | None = None,
+        *,
+        n_jobs: int | None = None,
     ) -> TrajectoryDataset:
         """Fly episodes from random initial states under random control parameters.
 
@@ -171,6 +207,9 @@ class Environment(ABC):
             Seed. Every episode has a seed of its own derived from it: the first episodes of
             a larger collection are those of a smaller one. Training and test data need
             different seeds.
+        n_jobs : int or None, default=None
+            Number of joblib workers that share the episodes; -1 takes all processors, None one
+            unless in a ``joblib.parallel_config``. The episodes are the same with any number.
 
         Returns
         -------
@@ -184,8 +223,8 @@ class Environment(ABC):
         Raises
         ------
         ValueError
-            If ``n_episodes`` or ``length`` is not a positive integer, or if an episode still
-            ends early after ``max_draws`` draws.
+            If ``n_episodes`` or ``length`` is not a positive integer, if an episode still ends
+            early after ``max_draws`` draws, or if the simulation of one goes wrong.
 
         Notes
         -----
@@ -201,7 +240,8 @@ class Environment(ABC):
         for _ in range(self.max_draws):
             starts = np.stack([self._draw_initial_state(streams[i].state) for i in pending])
             params = np.stack([self._draw_params(streams[i].params) for i in pending])
-            for i, episode in zip(pending, self._fly(starts, params, length, policy), strict=True):
+            episodes = self._fly_parallel(starts, params, length, policy, pending, n_jobs)
+            for i, episode in zip(pending, episodes, strict=True):
                 if not (self.redraw_terminated and episode.terminated):
                     kept[i] = episode
             pending = [i for i in pending if i not in kept]
@@ -243,7 +283,8 @@ class Environment(ABC):
         ------
         ValueError
             If a shape is wrong, a number is not finite, ``params`` is None without a
-            ``policy``, or the policy answers with actions of a wrong shape or not finite.
+            ``policy``, the policy answers with actions of a wrong shape or not finite, or the
+            simulation of an episode goes wrong.
 
         Notes
         -----
@@ -274,7 +315,31 @@ class Environment(ABC):
             )
         _require_finite(theta, "params")
         length = _positive_integer(length, "length")
-        return self._dataset(self._fly(starts, theta, length, policy or self.policy))
+        numbers = range(len(starts))
+        return self._dataset(self._fly(starts, theta, length, policy or self.policy, numbers))
+
+    def _fly_parallel(
+        self,
+        starts: NDArray[np.float64],
+        params: NDArray[np.float64],
+        length: int,
+        policy: Policy,
+        numbers: Sequence[int],
+        n_jobs: int | None,
+    ) -> list[_Episode]:
+        """Share the episodes among joblib's workers, a stretch each."""
+        from joblib import Parallel, delayed, effective_n_jobs
+
+        n_workers = min(effective_n_jobs(n_jobs), len(starts))
+        if n_workers == 1:
+            return self._fly(starts, params, length, policy, numbers)
+        edges = np.linspace(0, len(starts), n_workers + 1).astype(int)
+        shares = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        parts = Parallel(n_jobs=n_jobs)(
+            delayed(self._fly)(starts[part], params[part], length, policy, numbers[part])
+            for part in shares
+        )
+        return [episode for part in parts for episode in part]
 
     def _fly(
         self,
@@ -282,8 +347,12 @@ class Environment(ABC):
         params: NDArray[np.float64],
         length: int,
         policy: Policy,
+        numbers: Sequence[int],
     ) -> list[_Episode]:
-        """Step all episodes at once, dropping each from the batch when it ends."""
+        """Step all episodes at once, dropping each from the batch when it ends.
+
+        ``numbers`` are the names of the episodes in messages.
+        """
         n = len(starts)
         states = np.empty((n, length + 1, len(self.state_names)))
         actions = np.empty((n, length, len(self.action_names)))
@@ -291,16 +360,22 @@ class Environment(ABC):
         terminated = np.zeros(n, dtype=bool)
         states[:, 0] = current = starts
         flying, gains = np.arange(n), params
+        advance = self._simulator(starts)
         for t in range(length):
             times = np.full(len(flying), t * self.dt)
             wanted = policy(current, gains, times)
             applied = self._clipped(wanted, len(flying), f"the policy's actions at step {t}")
-            current = self._step(current, applied)
-            if not np.isfinite(current).all():
+            try:
+                current = advance(flying, current, applied)
+                if not np.isfinite(current).all():
+                    row = int(np.argwhere(~np.isfinite(current))[0, 0])
+                    raise _SimulationError(row, "left the finite numbers")
+            except _SimulationError as error:
                 raise ValueError(
-                    f"the simulation left the finite numbers at step {t}: the step dt={self.dt} "
-                    "is too long for these params, or the initial states are too large."
-                )
+                    f"the simulation of episode {numbers[flying[error.row]]} {error.reason} at step "
+                    f"{t}: the step dt={self.dt} is too long for the params "
+                    f"{gains[error.row].tolist()}, or the initial state is too large."
+                ) from error
             actions[flying, t] = applied
             states[flying, t + 1] = current
             ended = self.is_terminal(current)

@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
@@ -247,18 +248,22 @@ def _map_folds(
     *args: Any,
 ) -> list[Any]:
     """``work(clone, ds, fold, *args)`` of each fold, in order."""
-    run = _on_one_thread if effective_n_jobs(n_jobs) > 1 else _plainly
-    results: Iterator[Any] = Parallel(n_jobs=n_jobs, return_as="generator")(
-        delayed(run)(work, clone(estimator), ds, fold, *args) for fold in folds
-    )
-    return list(tqdm(results, total=len(folds), desc="folds", disable=not verbose))
+    parallel = effective_n_jobs(n_jobs) > 1
+    # here for workers that are threads, in `_run` for those that are processes
+    with _one_thread() if parallel else nullcontext():
+        results: Iterator[Any] = Parallel(n_jobs=n_jobs, return_as="generator")(
+            delayed(_run)(parallel, work, clone(estimator), ds, fold, *args) for fold in folds
+        )
+        return list(tqdm(results, total=len(folds), desc="folds", disable=not verbose))
 
 
-def _plainly(work: Callable[..., Any], *args: Any) -> Any:
-    return work(*args)
-
-
-def _on_one_thread(work: Callable[..., Any], *args: Any) -> Any:
-    # several workers with several threads each would wait for one another
-    with threadpool_limits(limits=1), threads_for(0):
+def _run(parallel: bool, work: Callable[..., Any], *args: Any) -> Any:
+    with _one_thread() if parallel else nullcontext():
         return work(*args)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Workers with several threads each would wait for one another."""
+    with threadpool_limits(limits=1), threads_for(0):
+        yield

@@ -76,7 +76,6 @@ def horizon_errors(
     ds = with_states_of(forecast, truth)
     errors = forecast.squared_errors(ds).mean(axis=2)
     check_same_times(forecast, ds)
-    errors[np.arange(errors.shape[1]) >= forecast.lengths[:, None]] = np.nan
     index = pd.Index(ds.ids[episode_of(forecast)], name="episode")
     if forecast.episode is not None:
         index = pd.MultiIndex.from_arrays([index, forecast.start], names=["episode", "start"])
@@ -193,8 +192,7 @@ def _quantile(values: Floats, q: float) -> Floats:
     """Linear quantile of each column; NaN is absent, +inf an ordinary (largest) value."""
     ordered = np.sort(values, axis=0)  # NaN last, after inf
     count = (~np.isnan(values)).sum(axis=0)
-    # rounded: 0.65 * 20 must be 13, not a hair more, or an infinite neighbour would count
-    position = np.round(q * np.maximum(count - 1, 0), 9)
+    position = q * np.maximum(count - 1, 0)
     below = np.floor(position).astype(np.intp)
     weight = position - below
     low = np.take_along_axis(ordered, below[None], axis=0)[0]

@@ -87,7 +87,9 @@ def plot_horizon_errors(
     if greatest > ceiling:
         ax.set_ylim(top=ceiling)
     if training_length is not None:
-        ax.axvline(training_length, color=GREY, lw=1, ls="dotted", label="longest horizon in training")
+        ax.axvline(
+            training_length, color=GREY, lw=1, ls="dotted", label="longest horizon in training"
+        )
     ax.set_xlabel("horizon (steps)")
     ax.set_ylabel("squared error (training range = 1)")
     columns = 1 if max(map(len, summaries)) > 16 else 2

@@ -109,4 +109,5 @@ class Ensemble:
 
 
 def _numpy(tensor: torch.Tensor) -> Singles:
-    return np.array(tensor.cpu(), dtype=np.float32)
+    array: Singles = tensor.cpu().numpy().copy()
+    return array

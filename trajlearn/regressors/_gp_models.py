@@ -117,7 +117,7 @@ def exact_objective(kernel: Any, inputs: Floats, targets: Floats) -> Objective:
     """
     from linear_operator.utils.cholesky import psd_safe_cholesky
 
-    x, y = torch.from_numpy(inputs), torch.from_numpy(targets)
+    x, y = torch.tensor(inputs), torch.tensor(targets)  # copies, aligned: same data, same bits
     n = len(y)
 
     def objective(theta: Floats) -> tuple[float, Floats]:
@@ -147,7 +147,7 @@ def sparse_objective(kernel: Any, inputs: Floats, targets: Floats, m: int) -> Ob
     """
     from linear_operator.utils.cholesky import psd_safe_cholesky
 
-    x, y = torch.from_numpy(inputs), torch.from_numpy(targets)
+    x, y = torch.tensor(inputs), torch.tensor(targets)  # copies, aligned: same data, same bits
     n, d = x.shape
     n_theta = d + 2
     eye = torch.eye(m, dtype=x.dtype)

@@ -134,13 +134,13 @@ class _Explained:
         m = len(root)
         width = -(-m // 8) * 8
         self._root = torch.zeros((width, width), dtype=torch.float64)
-        self._root[:m, :m] = torch.from_numpy(root)
+        self._root.numpy()[:m, :m] = root
         self._rows = torch.zeros((BLOCK, width), dtype=torch.float64)
         self._out = torch.empty_like(self._rows)
 
     def __call__(self, cross: Floats) -> Floats:
         n, m = cross.shape
-        self._rows[:n, :m] = torch.from_numpy(cross)
+        self._rows.numpy()[:n, :m] = cross
         torch.mm(self._rows, self._root.T, out=self._out)
         explained: Floats = np.square(self._out.numpy()[:n]).sum(axis=1)
         return explained
@@ -150,7 +150,7 @@ def _cholesky(matrix: Floats) -> Floats:
     """Lower Cholesky factor; a little is added to the diagonal where round-off asks for it."""
     from linear_operator.utils.cholesky import psd_safe_cholesky
 
-    factor: Floats = psd_safe_cholesky(torch.from_numpy(matrix)).numpy()
+    factor: Floats = psd_safe_cholesky(torch.tensor(matrix)).numpy()
     return factor
 
 

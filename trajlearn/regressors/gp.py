@@ -45,7 +45,7 @@ class GPRegressor(RegressorMixin, BaseEstimator):
         Covariance function; the digits of Matern's are twice its smoothness (nu 1/2, 3/2, 5/2).
     n_restarts : int, default=2
         Starts of L-BFGS drawn from the priors, beside the one at the priors' medians. With more
-        than 400 rows the starts compete on 400 of them and the best goes on with all.
+        than 200 rows the starts compete on 200 of them and the best goes on with all.
     max_iter : int, default=100
         Iterations of L-BFGS for every start. Exact fits rarely need 60; a sparse fit, which
         moves its inducing points, usually spends them all.
@@ -180,22 +180,25 @@ class GPRegressor(RegressorMixin, BaseEstimator):
         ConvergenceWarning
             If an exact fit used up `max_iter`.
         """
-        rows, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
-        targets: Floats = check_array(y, dtype=np.float64, ensure_2d=False, input_name="y")
-        self._y_ndim = targets.ndim
-        targets = targets[:, None] if targets.ndim == 1 else targets
+        # C order, and targets one by one: the bits of a sum depend on how its terms lie in memory
+        rows, y = validate_data(
+            self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, order="C"
+        )
+        y = check_array(y, dtype=np.float64, ensure_2d=False, input_name="y")
+        self._y_ndim = y.ndim
+        targets: Floats = np.ascontiguousarray(y.reshape(len(y), -1).T)
         self.input_offset_, self.input_scale_ = _input_standardisation(rows)
         self.target_mean_, self.target_scale_ = _target_standardisation(targets)
         self.is_sparse_ = len(rows) > self.max_exact
         inputs = (rows - self.input_offset_) / self.input_scale_
-        targets = (targets - self.target_mean_) / self.target_scale_
+        targets = (targets - self.target_mean_[:, None]) / self.target_scale_[:, None]
 
         draws = Draws.make(check_random_state(self.random_state), inputs.shape, self.n_restarts)
         with threadpool_limits(1), threads_for(0.0):
-            found = [self._search(inputs, target, draws) for target in targets.T]
+            found = [self._search(inputs, target, draws) for target in targets]
             self._set_hyperparameters([minimum for minimum, _ in found])
             self.basis_ = np.stack([basis for _, basis in found[: None if self.is_sparse_ else 1]])
-            posteriors = [self._condition(i, inputs, target) for i, target in enumerate(targets.T)]
+            posteriors = [self._condition(i, inputs, target) for i, target in enumerate(targets)]
         self.weights_ = np.stack([p.weights for p in posteriors])
         self.root_ = np.stack([p.root for p in posteriors])
         log_likelihood = np.array([p.log_likelihood for p in posteriors])
@@ -310,9 +313,10 @@ def _input_standardisation(X: Floats) -> tuple[Floats, Floats]:
     return offset, scale
 
 
-def _target_standardisation(y: Floats) -> tuple[Floats, Floats]:
+def _target_standardisation(targets: Floats) -> tuple[Floats, Floats]:
+    """Mean and scale of every target (a row each)."""
     with np.errstate(over="ignore", invalid="ignore"):
-        mean, scale = standardisation(y, None)
+        mean, scale = np.array([standardisation(target, None) for target in targets]).T
     _check_finite(scale, "y")
     return mean, scale
 

@@ -123,7 +123,7 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
     >>> import numpy as np
     >>> from trajlearn import MLPEnsembleRegressor
     >>> X = np.linspace(-1, 1, 200)[:, None]
-    >>> model = MLPEnsembleRegressor(hidden_layer_sizes=(32, 32), random_state=0)
+    >>> model = MLPEnsembleRegressor(hidden_layer_sizes=(64, 64), learning_rate=0.01, random_state=0)
     >>> model.fit(X, np.sin(3 * X[:, 0])).score(X, np.sin(3 * X[:, 0])) > 0.99
     True
     """

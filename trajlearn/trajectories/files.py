@@ -280,5 +280,5 @@ def _checksum(ds: TrajectoryDataset) -> int:
         columns.terminated,
         np.where(np.isnan(columns.time_origin), np.nan, columns.time_origin),
     ):
-        total = zlib.crc32(b"" if values is None else np.ascontiguousarray(values), total)
+        total = zlib.crc32(b"" if values is None else np.ascontiguousarray(values).data, total)
     return total
