@@ -25,6 +25,7 @@ extensions = [
 ]
 exclude_patterns = ["_build", "_templates", "**.ipynb_checkpoints"]
 templates_path = ["_templates"]
+default_role = "py:obj"  # `names` in docstrings become links where there is something to link
 
 # API reference: one generated page per public name; no parameter documented that is not there.
 autosummary_generate = True
@@ -43,7 +44,12 @@ nb_merge_streams = True
 
 html_theme = "pydata_sphinx_theme"
 html_title = f"trajlearn {release}"
-html_theme_options = {"navigation_with_keys": False, "show_toc_level": 2}
+html_theme_options = {
+    "header_links_before_dropdown": 6,
+    "navigation_with_keys": False,
+    "show_toc_level": 2,
+}
+html_sidebars = {page: [] for page in ("guide/*", "notebooks/*", "glossary", "c*")}
 html_show_sourcelink = False
 
 
@@ -59,8 +65,9 @@ def copy_notebooks(source: Path, target: Path) -> None:
 def skip_inherited_boilerplate(
     app: Sphinx, what: str, name: str, obj: Any, skip: bool, options: Any
 ) -> bool | None:
-    """Leave the accessors out that scikit-learn's metadata routing puts on every estimator."""
-    if name.startswith("set_") and name.endswith("_request"):
+    """Leave out what every estimator has from scikit-learn: its pages say more than ours could."""
+    made_by_routing = name.startswith("set_") and name.endswith("_request")
+    if made_by_routing or (getattr(obj, "__module__", None) or "").startswith("sklearn."):
         return True
     return None
 

@@ -9,6 +9,8 @@ from hypothesis import HealthCheck, settings
 for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(variable, "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
+# scipy reads this once too: scikit-learn's check of array API input then runs instead of skipping.
+os.environ.setdefault("SCIPY_ARRAY_API", "1")
 
 # Examples that train a model are slow by nature: few of them, and no deadline on any.
 settings.register_profile(

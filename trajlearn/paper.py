@@ -21,6 +21,7 @@ from trajlearn.trajectories import SubtrajectoryRelabeler
 
 __all__ = ["MODELS", "model"]
 
+#: Names that `model` takes.
 MODELS = ("D", "P", "DE", "PE", "T", "TP", "TE", "TPE", "GP", "NN")
 
 # 80 % of the paper's cap of 1e5 sub-trajectories: its split held out the rest

@@ -18,11 +18,37 @@ class InstallationError(RuntimeError):
     """An environment could not be made; the message names the log."""
 
 
+def interpreter() -> Path:
+    """Interpreter of the environment, made on first use and when the requirements change.
+
+    Raises
+    ------
+    InstallationError
+    """
+    python = ENVIRONMENT / "bin" / "python"
+    steps = _installation()
+    marker = ENVIRONMENT / ".installed"
+    if marker.is_file() and marker.read_text(encoding="utf-8") == repr(steps):
+        return python
+    print(f"Making {ENVIRONMENT.name} for mbrl-lib; this takes minutes once.", file=sys.stderr)
+    subprocess.run([sys.executable, "-m", "venv", "--clear", ENVIRONMENT], check=True)
+    log = ENVIRONMENT / "install.log"
+    with log.open("w", encoding="utf-8") as out:
+        for step in steps:
+            command = [str(python), "-m", "pip", "install", "--no-input", "--prefer-binary", *step]
+            done = subprocess.run(command, stdout=out, stderr=subprocess.STDOUT, check=False)
+            if done.returncode:
+                raise InstallationError(
+                    f"mbrl-lib could not be installed (exit status {done.returncode}); see {log}."
+                )
+    marker.write_text(repr(steps), encoding="utf-8")
+    return python
+
+
 def run(
-    sizes: Sequence[int], effort: Mapping[str, Any]
+    python: Path, sizes: Sequence[int], effort: Mapping[str, Any]
 ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Package versions of the environment, and rows as `measure` gives them."""
-    python = _python()
     one_thread = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
     done = subprocess.run(
         [python, "-m", "benchmarks.speed._mbrl_worker", json.dumps({"sizes": sizes, **effort})],
@@ -34,28 +60,6 @@ def run(
     )
     answer = json.loads(done.stdout.splitlines()[-1])
     return answer["packages"], answer["rows"]
-
-
-def _python() -> Path:
-    """Interpreter of the environment, made on first use or when the requirements change."""
-    python = ENVIRONMENT / "bin" / "python"
-    steps = _installation()
-    marker = ENVIRONMENT / ".installed"
-    if marker.is_file() and marker.read_text(encoding="utf-8") == repr(steps):
-        return python
-    print(f"Making {ENVIRONMENT.name} for mbrl-lib; this takes minutes once.", file=sys.stderr)
-    subprocess.run([sys.executable, "-m", "venv", "--clear", ENVIRONMENT], check=True)
-    log = ENVIRONMENT / "install.log"
-    with log.open("w", encoding="utf-8") as out:
-        for step in steps:
-            command = [python, "-m", "pip", "install", "--no-input", "--prefer-binary", *step]
-            done = subprocess.run(command, stdout=out, stderr=subprocess.STDOUT, check=False)
-            if done.returncode:
-                raise InstallationError(
-                    f"mbrl-lib could not be installed (exit status {done.returncode}); see {log}."
-                )
-    marker.write_text(repr(steps), encoding="utf-8")
-    return python
 
 
 def _installation() -> list[list[str]]:

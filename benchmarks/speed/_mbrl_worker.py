@@ -16,9 +16,9 @@ from benchmarks.speed._gemm import training_products
 from benchmarks.speed._timing import Case, measure
 
 
-def rows(
+def timings(
     sizes: Sequence[int],
-    steps: int,
+    rows: int,
     rounds: int,
     batch_sizes: Sequence[int],
     members: Sequence[int],
@@ -27,19 +27,15 @@ def rows(
     found = []
     for batch_size in batch_sizes:
         for n_members in members:
-            base = training_products(sizes, n_members, batch_size)
-
-            def products(base: Callable[[], None] = base) -> None:
-                for _ in range(steps):
-                    base()
-
+            steps = rows // batch_size
+            base = training_products(sizes, n_members, batch_size, steps)
             trainings = {
                 f"mbrl-lib, {kind}": _trainer(
-                    sizes, n_members, batch_size, steps, deterministic=kind == "deterministic"
+                    sizes, n_members, batch_size, rows, deterministic=kind == "deterministic"
                 )
                 for kind in ("deterministic", "probabilistic")
             }
-            cases = [Case("bare GEMM, mbrl-lib's environment", products, steps)]
+            cases = [Case("bare GEMM, mbrl-lib's environment", base, steps)]
             cases += [Case(name, call, steps) for name, call in trainings.items()]
             labels = {"batch_size": batch_size, "n_members": n_members}
             found += measure(cases, rounds=rounds, **labels)
@@ -47,12 +43,11 @@ def rows(
 
 
 def _trainer(
-    sizes: Sequence[int], n_members: int, batch_size: int, steps: int, *, deterministic: bool
+    sizes: Sequence[int], n_members: int, batch_size: int, n_rows: int, *, deterministic: bool
 ) -> Callable[[], object]:
     """One pass over the rows, inputs normalised as in mbrl-lib's own examples, no evaluation."""
     n_inputs, hidden, *more, n_targets = sizes
     rng = np.random.default_rng(0)
-    n_rows = steps * batch_size
     states = rng.normal(size=(n_rows, n_targets)).astype(np.float32)
     rest = rng.normal(size=(n_rows, n_inputs - n_targets)).astype(np.float32)
     after = rng.normal(size=(n_rows, n_targets)).astype(np.float32)
@@ -79,7 +74,7 @@ def main() -> None:
     torch.set_num_threads(1)
     settings = json.loads(sys.argv[1])
     packages = {name: version(name) for name in ("mbrl", "torch", "numpy", "hydra-core")}
-    print(json.dumps({"packages": packages, "rows": rows(**settings)}))
+    print(json.dumps({"packages": packages, "rows": timings(**settings)}))
 
 
 if __name__ == "__main__":

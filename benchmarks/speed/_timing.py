@@ -48,7 +48,7 @@ def measure(
     seconds = np.empty((rounds, len(cases)))
     with _without_garbage_collection():
         for k in range(rounds):
-            for j in np.roll(np.arange(len(cases)), -k):
+            for j in np.roll(np.arange(len(cases)), -k).tolist():
                 seconds[k, j] = _time(cases[j].run, repeats[j]) / cases[j].units
     ratios = seconds / seconds[:, :1]
     return [

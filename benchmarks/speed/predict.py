@@ -104,7 +104,9 @@ class _Models:
         rows = self._rows(*_starts(episodes, 10)).astype(np.float32)
         targets = rows[:, : episodes.states.shape[1]]
         # as many outputs as states; what they mean costs nothing
-        self.scikit_learn = MLPRegressor(hidden_layer_sizes=HIDDEN, random_state=0).partial_fit(rows, targets)
+        self.scikit_learn = MLPRegressor(hidden_layer_sizes=HIDDEN, random_state=0).partial_fit(
+            rows, targets
+        )
         self.sizes = (rows.shape[1], *HIDDEN, targets.shape[1])
         a, b, c, d = self.sizes
         self.naive = torch.nn.Sequential(

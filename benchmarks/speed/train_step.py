@@ -52,34 +52,36 @@ COLUMNS: Columns = {
 class Effort:
     """How much to run."""
 
-    steps: int
+    rows: int
     rounds: int
     batch_sizes: Sequence[int] = (64, 256)
     members: Sequence[int] = (1, 5)
 
 
-EFFORT = {"quick": Effort(steps=100, rounds=5), "full": Effort(steps=200, rounds=25)}
+EFFORT = {"quick": Effort(rows=6_400, rounds=5), "full": Effort(rows=25_600, rounds=15)}
 
 
 def run(mode: str, effort: Effort, *, mbrl: bool = False) -> dict[str, Any]:
     """Time every case; the members of an ensemble are compared with as many times the products."""
+    # first, because it may fail
+    python = _mbrl.interpreter() if mbrl else None
     rows: list[Row] = []
     with one_thread():
         for batch_size in effort.batch_sizes:
             for n_members in effort.members:
-                cases = _cases(batch_size, n_members, effort.steps)
+                cases = _cases(batch_size, n_members, effort.rows)
                 labels = {"batch_size": batch_size, "n_members": n_members}
                 rows += measure(cases, rounds=effort.rounds, **labels)
     settings: dict[str, Any] = {"sizes": SIZES, **asdict(effort)}
-    if mbrl:
-        settings["mbrl"], others = _mbrl.run(SIZES, asdict(effort))
+    if python is not None:
+        settings["mbrl"], others = _mbrl.run(python, SIZES, asdict(effort))
         rows = sorted(rows + others, key=lambda row: (row["batch_size"], row["n_members"]))
     return result(NAME, mode, rows, settings)
 
 
-def _cases(batch_size: int, n_members: int, steps: int) -> list[Case]:
+def _cases(batch_size: int, n_members: int, n_rows: int) -> list[Case]:
     rng = np.random.default_rng(0)
-    n_rows = steps * batch_size
+    steps = n_rows // batch_size
     x = torch.from_numpy(rng.normal(size=(n_rows, N_INPUTS)).astype(np.float32))
     y = torch.from_numpy(rng.normal(size=(n_rows, N_TARGETS)).astype(np.float32))
     goal = GOALS.get((batch_size, n_members), "")
@@ -87,9 +89,9 @@ def _cases(batch_size: int, n_members: int, steps: int) -> list[Case]:
     def ours(activation: str, probabilistic: bool) -> Callable[[], object]:
         return _ours(x, y, n_members, batch_size, activation, probabilistic=probabilistic)
 
-    base = training_products(SIZES, n_members, batch_size)
+    base = training_products(SIZES, n_members, batch_size, steps)
     cases = [
-        Case("bare GEMM", lambda: [base() for _ in range(steps)], steps),
+        Case("bare GEMM", base, steps),
         Case("trajlearn", ours("relu", False), steps, goal),
         Case("trajlearn, SiLU (its default)", ours("silu", False), steps, goal),
         Case("trajlearn, probabilistic", ours("relu", True), steps),
@@ -113,7 +115,9 @@ def _ours(
 ) -> Callable[[], object]:
     """The loop behind `MLPEnsembleRegressor.fit`, without the checks around it."""
     ensemble = Ensemble(
-        SIZES,
+        N_INPUTS,
+        N_TARGETS,
+        HIDDEN,
         n_members,
         activation,
         nll_beta=0.5 if probabilistic else None,

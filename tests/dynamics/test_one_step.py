@@ -346,7 +346,9 @@ def test_std_of_a_linear_gaussian_system_is_the_closed_form(std, propagation):
     forecast = model.predict(ds, return_std=True, random_state=0)
     np.testing.assert_allclose(forecast.mean, truth(ds), atol=1e-12)
     expected = noise * np.sqrt(np.cumsum(0.8 ** (2 * np.arange(11))))
-    np.testing.assert_allclose(forecast.std[:, :, 0], np.tile(expected, (3, 1)), rtol=0.05, atol=1e-12)
+    np.testing.assert_allclose(
+        forecast.std[:, :, 0], np.tile(expected, (3, 1)), rtol=0.05, atol=1e-12
+    )
 
 
 def test_feedback_damps_the_noise_of_every_particle():

@@ -16,13 +16,6 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteK
 from sklearn.model_selection import GridSearchCV
 
 from tests.sklearn_checks import run_checks
-from trajlearn.regressors._gp_models import (
-    Hyperparameters,
-    build_kernel,
-    exact_objective,
-    sparse_objective,
-)
-from trajlearn.regressors._gp_posterior import exact_posterior, predict_rows, sparse_posterior
 from trajlearn.regressors.gp import GPRegressor
 
 KERNELS = ["rbf", "matern12", "matern32", "matern52"]
@@ -46,12 +39,6 @@ def fitted():
 def sparse_fitted():
     X, y, f = wave(2500, 4)
     return GPRegressor(n_inducing=80, max_iter=40, random_state=0).fit(X, y), X, y, f
-
-
-def slopes(objective, at):
-    """Central differences; the step is large because Matern 1/2 magnifies round-off."""
-    steps = 1e-4 * np.eye(len(at))
-    return [(objective(at + step)[0] - objective(at - step)[0]) / 2e-4 for step in steps]
 
 
 def sklearn_twin(gp, X, y, target=0):
@@ -164,71 +151,6 @@ def test_agrees_with_scikit_learn(kernel):
     np.testing.assert_allclose(std, y.std() * twin_std, atol=1e-6 * y.std())
     log_likelihood = twin.log_marginal_likelihood_value_ - len(y) * np.log(y.std())
     np.testing.assert_allclose(gp.log_marginal_likelihood_, log_likelihood, rtol=1e-8)
-
-
-def test_agrees_with_gpytorch():
-    import gpytorch
-
-    X, y, _ = wave(40, 2)
-    X, y = (X - X.mean(axis=0)) / X.std(axis=0), (y - y.mean()) / y.std()
-    gp = GPRegressor(n_restarts=0, random_state=0).fit(X, y)
-
-    class Model(gpytorch.models.ExactGP):
-        def __init__(self, x, y, likelihood):
-            super().__init__(x, y, likelihood)
-            self.mean_module = gpytorch.means.ZeroMean()
-            base = gpytorch.kernels.RBFKernel(ard_num_dims=2)
-            self.covar_module = gpytorch.kernels.ScaleKernel(base)
-
-        def forward(self, x):
-            return gpytorch.distributions.MultivariateNormal(
-                self.mean_module(x), self.covar_module(x)
-            )
-
-    likelihood = gpytorch.likelihoods.GaussianLikelihood().double()
-    model = Model(torch.from_numpy(X), torch.from_numpy(y), likelihood).double()
-    model.covar_module.base_kernel.lengthscale = torch.from_numpy(gp.length_scales_)
-    model.covar_module.outputscale = float(gp.signal_std_[0]) ** 2
-    likelihood.noise = float(gp.noise_std_[0]) ** 2
-    evidence = gpytorch.mlls.ExactMarginalLogLikelihood(likelihood, model)
-    value = 40 * evidence(model(*model.train_inputs), model.train_targets).item()
-    assert gp.log_marginal_likelihood_[0] == pytest.approx(value, rel=1e-8)
-    model.eval(), likelihood.eval()
-    new = wave(15, 2, seed=1)[0]
-    with torch.no_grad():
-        theirs = likelihood(model(torch.from_numpy(new)))
-    mean, std = gp.predict(new, return_std=True)
-    np.testing.assert_allclose(mean, theirs.mean.numpy(), atol=1e-6)
-    np.testing.assert_allclose(std, theirs.stddev.numpy(), atol=1e-6)
-
-
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_gradients_and_values_of_the_objectives(kernel):
-    X, y, _ = wave(25, 2)
-    theta = np.array([0.1, 0.5, 0.2, -2.0])
-    exact = exact_objective(build_kernel(kernel, 2), X, y)
-    np.testing.assert_allclose(exact(theta)[1], slopes(exact, theta), atol=5e-3)
-    sparse_ = sparse_objective(build_kernel(kernel, 2), X, y, 4)
-    flat = np.concatenate([theta, X[:4].ravel() + 0.1])
-    np.testing.assert_allclose(sparse_(flat)[1], slopes(sparse_, flat), atol=5e-3)
-    # the closed-form posteriors, which share no code with the objectives, report the same
-    h = Hyperparameters.from_theta(theta)
-    direct = exact_posterior(kernel, X, y, h)
-    assert exact(theta)[0] == pytest.approx(-direct.log_likelihood, rel=1e-8)
-    bound = sparse_posterior(kernel, X[:4] + 0.1, X, y, h).log_likelihood
-    assert sparse_(flat)[0] == pytest.approx(-bound, rel=1e-8)
-    assert bound < direct.log_likelihood
-
-
-def test_sparse_with_every_row_as_inducing_point_is_exact():
-    X, y, _ = wave(50, 2)
-    h = Hyperparameters(np.array([0.8, 1.1]), 1.5, 0.02)
-    exact, sparse_ = exact_posterior("rbf", X, y, h), sparse_posterior("rbf", X, X, y, h)
-    new = wave(30, 2, seed=1)[0]
-    ours = predict_rows("rbf", new, X, h, sparse_.weights, sparse_.root)
-    truth = predict_rows("rbf", new, X, h, exact.weights, exact.root)
-    np.testing.assert_allclose(ours, truth, atol=1e-4)
-    assert sparse_.log_likelihood == pytest.approx(exact.log_likelihood, abs=1e-3)
 
 
 def test_sparse_comes_close_to_exact(sparse_fitted):

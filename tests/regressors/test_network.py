@@ -174,11 +174,12 @@ def test_bounds_hold_and_prediction_clamps_as_training_does(
     # low + softplus(high - low) can pass `high` by log(1 + exp(low - high)); torch's softplus
     # is exact to 2e-9
     high = low + gap
-    slack = np.log1p(np.exp(-gap)) + 1e-7
-    in_training = _losses.bounded(*(torch.tensor([v]).double() for v in (raw, low, high))).item()
-    in_prediction = _prediction.bounded(*(np.array([v]) for v in (raw, low, high))).item()
-    assert low - 1e-7 <= in_training <= high + slack
-    assert in_prediction == pytest.approx(in_training, rel=1e-7, abs=1e-7)
+    slack = np.log1p(np.exp(-gap)) + 1e-8
+    values = [np.array([value]) for value in (raw, low, high)]
+    in_training = _losses.bounded(*map(torch.from_numpy, values)).item()
+    in_prediction = _prediction.bounded(*values).item()
+    assert low - 1e-8 <= in_training <= high + slack
+    assert in_prediction == pytest.approx(in_training, rel=1e-8, abs=1e-8)
 
 
 # -- optimiser and schedule ---------------------------------------------------------------
@@ -254,7 +255,7 @@ def test_budget_grows_with_the_rows_within_its_limits() -> None:
 # -- the loop -----------------------------------------------------------------------------
 
 
-def endless(x: Tensor, y: Tensor):  # noqa: ANN201
+def endless(x: Tensor, y: Tensor):
     while True:
         yield x, y, None
 
@@ -273,7 +274,9 @@ def test_a_training_run_is_that_of_autograd_and_torchs_optimiser(kind: str) -> N
         reference.loss(x, y, None).backward()
         optimizer.param_groups[0]["lr"] = learning_rate(step, settings)
         optimizer.step()
-    n_steps, losses, held_out = train(network, loss, Adam(network, loss, 0), endless(x, y), settings)
+    n_steps, losses, held_out = train(
+        network, loss, Adam(network, loss, 0), endless(x, y), settings
+    )
     torch.testing.assert_close(network.forward(x), reference.outputs(x).detach())
     assert n_steps == 40
     assert losses.shape == (40, 2)
@@ -311,7 +314,7 @@ def test_early_stopping_stops_and_keeps_the_best_weights_of_each_member(n_held_o
 # -- batches ------------------------------------------------------------------------------
 
 
-def numbers(n: int, n_members: int, batch_size: int, multiplicity=None):  # noqa: ANN001, ANN201
+def numbers(n: int, n_members: int, batch_size: int, multiplicity=None):
     """Row numbers (E, B) of successive batches."""
     x = torch.arange(n, dtype=torch.float64)[:, None]
     rng = np.random.default_rng(0)
@@ -345,7 +348,9 @@ def test_rows_are_drawn_in_proportion_to_their_multiplicity() -> None:
 
 
 def test_all_rows_come_as_one_batch_if_they_fit() -> None:
-    rows = Rows(np.arange(6.0).reshape(3, 2), np.array([[1.0], [3.0], [5.0]]), np.array([1, 1, 4.0]))
+    rows = Rows(
+        np.arange(6.0).reshape(3, 2), np.array([[1.0], [3.0], [5.0]]), np.array([1, 1, 4.0])
+    )
     convert = ToTensors(np.array([3.0]), np.array([2.0]), CPU)
     rng = np.random.default_rng(0)
     counts = np.array([[1.0, 2.0, 0.0], [1.0, 1.0, 1.0]])

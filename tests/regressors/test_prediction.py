@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from functools import cache
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ def make_predictor(
     widths: tuple[int, ...] = (N_FEATURES, 12, 10, 3), n_members: int = 2, activation: str = "silu"
 ) -> Predictor:
     rng = np.random.default_rng(0)
-    shapes = list(zip(widths, widths[1:]))
+    shapes = list(pairwise(widths))
     return Predictor(
         [rng.normal(size=(n_members, a, b)).astype(np.float32) / a**0.5 for a, b in shapes],
         [rng.normal(size=(n_members, 1, b)).astype(np.float32) for _, b in shapes],
@@ -63,9 +64,7 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
 @pytest.mark.parametrize("activation", ["relu", "silu", "tanh"])
 @pytest.mark.parametrize("widths", [(4, 12, 10, 3), (4, 16, 5), (4, 2)])
 @pytest.mark.parametrize("n", [1, BLOCK, BLOCK + 1])
-def test_outputs_are_those_of_the_network(
-    activation: str, widths: tuple[int, ...], n: int
-) -> None:
+def test_outputs_are_those_of_the_network(activation: str, widths: tuple[int, ...], n: int) -> None:
     predictor, x = make_predictor(widths, activation=activation), make_rows(n)
     out = predictor(x)
     assert out.shape == (2, n, widths[-1])
@@ -88,15 +87,23 @@ def test_a_row_gets_the_same_bits_alone_in_a_batch_in_any_order(
         np.testing.assert_array_equal(predictor(x[i : i + 1]), together[:, i : i + 1])
 
 
-def test_several_threads_give_the_same_bits() -> None:
+def test_several_threads_give_the_same_bits_as_one() -> None:
     predictor, x = make_predictor((4, 600, 600, 3), n_members=3), make_rows(200)
+    activation, seen = predictor._act, set()
+
+    def spy(z: torch.Tensor, out: torch.Tensor) -> None:
+        seen.add(torch.get_num_threads())
+        activation(z, out)
+
+    predictor._act = spy
     one = predictor(x)
     torch.set_num_threads(2)
     try:
-        two = predictor(x)
+        np.testing.assert_array_equal(predictor(x), one)
+        assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(1)
-    np.testing.assert_array_equal(one, two)
+    assert seen == {1}
 
 
 # nine members of one target: where numpy would add the members of a single row in another order

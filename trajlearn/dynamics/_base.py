@@ -13,6 +13,8 @@ from trajlearn._persistence import SaveMixin
 from trajlearn._sklearn import HasMethods, fit_context
 from trajlearn.dynamics._learner import Moments, fit_learner, mixture, moments_of, seeded
 from trajlearn.dynamics.scaling import BlockScaler
+from trajlearn.exceptions import InvalidEpisodeError
+from trajlearn.regressors._prediction import mean_of_members
 from trajlearn.trajectories import TrajectoryDataset, as_dataset, is_episodes
 from trajlearn.trajectories._layout import Layout
 
@@ -75,7 +77,17 @@ class TwoDoorRegressor(SaveMixin, RegressorMixin, BaseEstimator):
         return tags
 
     def set_params(self, **params: Any) -> Self:
-        """Set parameters; nested names such as ``estimator__max_steps`` reach the defaults too."""
+        """Set parameters; nested names such as ``estimator__max_steps`` reach the defaults too.
+
+        Parameters
+        ----------
+        **params
+            By name.
+
+        Returns
+        -------
+        self
+        """
         # first the estimator's own, which its defaults depend on
         own = {key: value for key, value in params.items() if "__" not in key}
         super().set_params(**own)
@@ -86,11 +98,21 @@ class TwoDoorRegressor(SaveMixin, RegressorMixin, BaseEstimator):
         return super().set_params(**nested)
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """Get parameters; with `deep` also those of the defaults."""
+        """Get parameters.
+
+        Parameters
+        ----------
+        deep : bool, default=True
+            Also those of nested estimators, of the defaults too.
+
+        Returns
+        -------
+        dict
+        """
         params = super().get_params(deep=deep)
         if deep:
             for name, default in self._defaults().items():
-                if params[name] is None:
+                if name in params and params[name] is None:
                     own = default.get_params()
                     params |= {f"{name}__{key}": value for key, value in own.items()}
         return params
@@ -134,6 +156,8 @@ class TwoDoorRegressor(SaveMixin, RegressorMixin, BaseEstimator):
         self.estimator_ = seeded(chosen["estimator"], self._rng)
         self.relabeler_ = seeded(chosen["relabeler"], self._rng)
         self.scaler_ = clone(chosen["scaler"])
+        if isinstance(X, (list, tuple)) and not len(X):
+            raise InvalidEpisodeError("X is empty: give at least one episode, or rows and y.")
         if is_episodes(X):
             if y is not None:
                 raise ValueError(
@@ -234,7 +258,7 @@ class TwoDoorRegressor(SaveMixin, RegressorMixin, BaseEstimator):
 
     def _predict_rows_of(self, rows: Floats, return_std: bool) -> Any:
         means, variances = self._moments()(rows)
-        mean = means.mean(axis=0)
+        mean = mean_of_members(means)
         shape = (slice(None), 0) if self._y_ndim == 1 else slice(None)
         if not return_std:
             return mean[shape]

@@ -11,6 +11,7 @@ from sklearn.multioutput import MultiOutputRegressor
 from sklearn.utils import get_tags
 from sklearn.utils.validation import has_fit_parameter
 
+from trajlearn.regressors._prediction import mixture as mixture_of_members
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 
 Floats = NDArray[np.float64]
@@ -60,6 +61,18 @@ def takes_weights(estimator: BaseEstimator) -> bool:
     return bool(has_fit_parameter(estimator, "sample_weight"))
 
 
+def spread(values: Floats, magnitude: Floats, weight: Floats | None) -> Floats:
+    """Standard deviation of each column (n, d): the unit in which it is learned.
+
+    A constant has its own size for a unit, and zero a trillionth of `magnitude` (d,): a learner
+    that is somewhat off must not move a state that never moved.
+    """
+    mean = np.average(values, axis=0, weights=weight)
+    std = np.sqrt(np.average((values - mean) ** 2, axis=0, weights=weight))
+    least = 1e-12 * np.maximum(magnitude, 1e-300)
+    return np.where(std > least, std, np.maximum(np.abs(mean), least))
+
+
 def moments_of(learner: Any) -> Moments:
     """Function from scaled rows (n, k) to means (E, n, d) and variances (E, n, d) or None."""
     if isinstance(learner, MLPEnsembleRegressor):
@@ -95,4 +108,4 @@ def mixture(means: Floats, variances: Floats | None, learner: Any) -> tuple[Floa
             f"{type(learner).__name__} gives no standard deviation. Use MLPEnsembleRegressor, "
             "GPRegressor or any regressor whose predict takes return_std."
         )
-    return means.mean(axis=0), variances.mean(axis=0) + means.var(axis=0)
+    return mixture_of_members(means, variances)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trajlearn.dynamics._learner import Moments
+from trajlearn.regressors._prediction import mean_of_members
 
 Floats = NDArray[np.float64]
 # rows of inputs for the states at a step: (states (m, d_s), step) -> (m, n_features)
@@ -71,7 +72,7 @@ def roll_out(
 
 def expected_step(moments: Moments) -> Callable[[Floats, int], Floats]:
     """Mean over members at every step."""
-    return lambda rows, k: moments(rows)[0].mean(axis=0)
+    return lambda rows, k: mean_of_members(moments(rows)[0])
 
 
 def sampled_step(

@@ -9,6 +9,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import Interval, fit_context
 from trajlearn.dynamics._base import TwoDoorRegressor
+from trajlearn.dynamics._learner import spread
 from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.regressors.gp import GPRegressor
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
@@ -69,10 +70,9 @@ class _DirectReward(TwoDoorRegressor):
         self._fit_rows(rows, rewards[:, None], weight, groups)
 
     def _fit_rows(self, rows: Floats, targets: Floats, weight: Floats | None, groups: Any) -> None:
-        mean = np.average(targets, axis=0, weights=weight)
-        scale = np.sqrt(np.average((targets - mean) ** 2, axis=0, weights=weight))
-        floor = 1e-12 * np.maximum(np.abs(mean), 1e-300)
-        self.target_mean_, self.target_scale_ = mean, np.where(scale > floor, scale, 1.0)
+        self.target_mean_ = np.average(targets, axis=0, weights=weight)
+        largest = np.abs(targets).max(axis=0)
+        self.target_scale_ = spread(targets - self.target_mean_, largest, weight)
         super()._fit_rows(rows, targets, weight, groups)
 
     def _learning_targets(self, rows: Floats, targets: Floats) -> tuple[Floats, Floats | None]:

@@ -22,38 +22,54 @@ _PER_FORECAST = ("times", "lengths", "initial_states", "initial_times", "start",
 class Forecast:
     """Predicted trajectories of n episodes over H steps.
 
+    What `forecast` and `predict` of a dynamics estimator return; hardly ever built by hand.
     Indexing by episode gives a forecast again and `numpy.concatenate` joins forecasts of
     different lengths, so that `cross_val_predict` works; ``np.asarray(forecast)`` is `mean`.
 
-    Attributes
+    Parameters
     ----------
     mean : ndarray of shape (n, H, d_s)
         Predicted states, from the first step after the start; NaN beyond `lengths` (padding),
         +inf from `diverged_at` on.
-    std : ndarray of shape (n, H, d_s) or None
-        Total predictive standard deviation.
-    samples : ndarray of shape (n_samples, n, H, d_s) or None
-        Whole trajectories.
     times : ndarray of shape (n, H)
         Time of each predicted state.
     horizons : ndarray of shape (H,)
         Steps after the start, or, from `predict_trajectory`, time after the start.
     lengths : ndarray of shape (n,)
         Predicted steps of each episode.
+    initial_states : ndarray of shape (n, d_s)
+        State that each forecast begins at.
+    initial_times : ndarray of shape (n,)
+        Its time.
+    start : ndarray of shape (n,)
+        Its index in the episode.
     diverged_at : ndarray of shape (n,)
         First step at which a forecast is non-finite or beyond 1e6 training ranges; 0 if none.
-    start : ndarray of shape (n,)
-        Index of the state that each forecast begins at.
-    episode : ndarray of shape (n,) or None
-        Episode of each forecast, where episodes have several starts; otherwise forecast i
-        belongs to episode i.
-    initial_states : ndarray of shape (n, d_s)
-    initial_times : ndarray of shape (n,)
     state_range : ndarray of shape (2, d_s)
         Least and greatest training states, which errors are normalised by.
     state_names : tuple of str
-    actions : {"none", "logged", "policy"}
+    actions : {"none", "logged", "policy"}, default="none"
         Where the actions of a roll-out came from.
+    std : ndarray of shape (n, H, d_s) or None, default=None
+        Total predictive standard deviation.
+    samples : ndarray of shape (n_samples, n, H, d_s) or None, default=None
+        Whole trajectories.
+    episode : ndarray of shape (n,) or None, default=None
+        Episode of each forecast, where episodes have several starts; otherwise forecast i
+        belongs to episode i.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sklearn.linear_model import LinearRegression
+    >>> from trajlearn import TrajectoryDataset, TrajectoryRegressor
+    >>> states = [np.linspace(0, slope, 5)[:, None] for slope in (1.0, 2.0)]
+    >>> ds = TrajectoryDataset.from_arrays(states, params=[[1.0], [2.0]])
+    >>> forecast = TrajectoryRegressor(LinearRegression(), random_state=0).fit(ds).predict(ds)
+    >>> forecast
+    Forecast(n=2, H=4, d_s=1)
+    >>> forecast.mean.shape, forecast[1:].mean.shape, forecast.at([2, 4]).horizons
+    ((2, 4, 1), (1, 4, 1), array([2, 4]))
     """
 
     def __init__(
@@ -135,6 +151,15 @@ class Forecast:
     def at(self, horizons: ArrayLike) -> "Forecast":
         """Only the given entries of `horizons`.
 
+        Parameters
+        ----------
+        horizons : array-like
+            Increasing; each must have been predicted.
+
+        Returns
+        -------
+        Forecast
+
         Raises
         ------
         ValueError
@@ -206,6 +231,10 @@ class Forecast:
         truth : TrajectoryDataset
             Episodes in the order of the forecasts (by `episode`, where given).
 
+        Returns
+        -------
+        ndarray of shape (n, H, d_s)
+
         Raises
         ------
         ValueError
@@ -242,6 +271,10 @@ class Forecast:
     def to_dataset(self) -> TrajectoryDataset:
         """Mean trajectories as episodes, the initial state first; cut where they diverge.
 
+        Returns
+        -------
+        TrajectoryDataset
+
         Raises
         ------
         ValueError
@@ -264,7 +297,14 @@ class Forecast:
         )
 
     def to_frame(self) -> "pd.DataFrame":
-        """Long table: forecast, horizon, time, then mean (and ``_std``) of each state."""
+        """Long table, one row a forecast and horizon.
+
+        Returns
+        -------
+        DataFrame
+            Columns ``episode``, ``start``, ``horizon``, ``time``, then the mean of each state by
+            its name, and its standard deviation as ``<name>_std`` where there is one.
+        """
         import pandas as pd
 
         n, n_horizons, _ = self.mean.shape

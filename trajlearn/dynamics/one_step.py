@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from trajlearn._sklearn import Interval, StrOptions
 from trajlearn.dynamics._base import TwoDoorRegressor
 from trajlearn.dynamics._dynamics import DIVERGENCE_RANGES, DynamicsEstimator, Prediction
-from trajlearn.dynamics._learner import mixture
+from trajlearn.dynamics._learner import mixture, spread
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics._rollout import InputRows, Limits, expected_step, roll_out, sampled_step
 from trajlearn.dynamics.scaling import BlockScaler
@@ -165,11 +165,8 @@ class OneStepRegressor(DynamicsEstimator):
             self._learn_ranges(states, tuple(self.layout_.columns["state"]), np.inf)
             self.relabeler_.dt_ = None
         self.dt_ = self.relabeler_.dt_
-        change = self._change(rows, targets)
-        mean = np.average(change, axis=0, weights=weight)
-        scale = np.sqrt(np.average((change - mean) ** 2, axis=0, weights=weight))
-        floor = 1e-12 * np.maximum(np.abs(targets).max(axis=0), 1e-300)
-        self.target_scale_ = np.where(scale > floor, scale, 1.0)
+        largest = np.abs(targets).max(axis=0)
+        self.target_scale_ = spread(self._change(rows, targets), largest, weight)
         super()._fit_rows(rows, targets, weight, groups)
 
     def _fit_episodes(

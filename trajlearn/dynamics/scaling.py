@@ -41,6 +41,7 @@ class HorizonFeatures(TransformerMixin, BaseEstimator):
     Parameters
     ----------
     n_scales : int, default=6
+        Number of decay times.
 
     Attributes
     ----------
@@ -64,7 +65,18 @@ class HorizonFeatures(TransformerMixin, BaseEstimator):
         self.n_scales = n_scales
 
     def fit(self, X: ArrayLike, y: None = None) -> Self:
-        """Learn L, d and the decay times of each column from horizons (n, n_columns)."""
+        """Learn L, d and the decay times of each column.
+
+        Parameters
+        ----------
+        X : array-like of shape (n, n_columns)
+            Horizons.
+        y : None
+
+        Returns
+        -------
+        self
+        """
         self._validate_params()
         h = np.abs(validate_data(self, X, dtype=np.float64))
         longest = h.max(axis=0)
@@ -76,7 +88,16 @@ class HorizonFeatures(TransformerMixin, BaseEstimator):
         return self
 
     def transform(self, X: ArrayLike) -> Floats:
-        """Features (n, (2 + n_scales) * n_columns)."""
+        """Features of horizons.
+
+        Parameters
+        ----------
+        X : array-like of shape (n, n_columns)
+
+        Returns
+        -------
+        ndarray of shape (n, (2 + n_scales) * n_columns)
+        """
         check_is_fitted(self)
         return self.features(validate_data(self, X, dtype=np.float64, reset=False))
 
@@ -100,11 +121,26 @@ class BlockScaler(TransformerMixin, BaseEstimator):
     Parameters
     ----------
     state, action, horizon, params : transformer, "passthrough" or None, default=None
+        What each block is scaled by.
 
     Attributes
     ----------
     parts_ : list of (columns, transformer)
         Columns of the input and the fitted transformer (None: division by `magnitude_`).
+
+    See Also
+    --------
+    HorizonFeatures : the choice of `TrajectoryRegressor` for `horizon`.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from trajlearn import BlockScaler
+    >>> rows = np.array([[0.0, 1.0, 5.0], [2.0, 3.0, 15.0]])  # two states, one parameter
+    >>> layout = {"state": slice(0, 2), "params": slice(2, 3)}
+    >>> BlockScaler().fit(rows, layout=layout).transform(rows)
+    array([[-1., -1., -1.],
+           [ 1.,  1.,  1.]])
     """
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
@@ -138,6 +174,10 @@ class BlockScaler(TransformerMixin, BaseEstimator):
             Default: all columns are states.
         sample_weight : ndarray of shape (n,), optional
             Passed to the transformers that take it.
+
+        Returns
+        -------
+        self
         """
         self._validate_params()
         rows: Floats = validate_data(self, X, dtype=np.float64)
@@ -193,7 +233,16 @@ class BlockScaler(TransformerMixin, BaseEstimator):
             self.affine_ = columns, scale, shift
 
     def transform(self, X: ArrayLike) -> Floats:
-        """Scaled rows (n, width), blocks in order."""
+        """Scaled rows, blocks in order.
+
+        Parameters
+        ----------
+        X : array-like of shape (n, n_features)
+
+        Returns
+        -------
+        ndarray of shape (n, width)
+        """
         check_is_fitted(self)
         return self.scaled(validate_data(self, X, dtype=np.float64, reset=False))
 

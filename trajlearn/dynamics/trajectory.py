@@ -9,14 +9,16 @@ from numpy.typing import NDArray
 from trajlearn._sklearn import Interval, StrOptions
 from trajlearn.dynamics._base import TwoDoorRegressor
 from trajlearn.dynamics._dynamics import DynamicsEstimator, Prediction
-from trajlearn.dynamics._learner import mixture, takes_weights
+from trajlearn.dynamics._learner import mixture, spread, takes_weights
 from trajlearn.dynamics._query import Query, make_query
 from trajlearn.dynamics.scaling import BlockScaler, HorizonFeatures
+from trajlearn.regressors._prediction import mean_of_members
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 from trajlearn.trajectories import SubtrajectoryRelabeler, TrajectoryDataset
 from trajlearn.trajectories._columns import runs
 from trajlearn.trajectories._layout import Layout
 from trajlearn.trajectories._pairs import Stretches
+from trajlearn.trajectories.times import time_steps
 
 __all__ = ["TrajectoryRegressor"]
 
@@ -198,11 +200,8 @@ class TrajectoryRegressor(DynamicsEstimator):
 
     def _learn_scale(self, rows: Floats, targets: Floats, weight: Floats | None) -> None:
         """Scale of what is predicted: the state, or its change."""
-        change = targets - self._baseline(rows)
-        mean = np.average(change, axis=0, weights=weight)
-        scale = np.sqrt(np.average((change - mean) ** 2, axis=0, weights=weight))
-        floor = 1e-12 * np.maximum(np.abs(targets).max(axis=0), 1e-300)
-        self.target_scale_ = np.where(scale > floor, scale, 1.0)
+        largest = np.abs(targets).max(axis=0)
+        self.target_scale_ = spread(targets - self._baseline(rows), largest, weight)
 
     def _baseline(self, rows: Floats) -> Floats | float:
         return rows[:, self.layout_["state"]] if self.baseline == "state" else 0.0
@@ -234,16 +233,17 @@ class TrajectoryRegressor(DynamicsEstimator):
         few = ds[:_RESIDUAL_EPISODES]
         query, _ = make_query(few, 0, None, within_log=True, within_stretch=True)
         means, variances = self._at(query)
-        mean = means.mean(axis=0)
-        std = np.ones_like(mean)
-        if variances is not None:
-            std = np.sqrt(np.maximum(mixture(means, variances, self.estimator_)[1], 1e-300))
         truth = query.future(few.states, steps=False)[:, 1:]
-        residual = np.where(query.known()[..., None], (truth - mean) / std, 0.0)
+        residual = np.where(query.known()[..., None], truth - mean_of_members(means), 0.0)
+        if variances is not None:
+            _, variance = mixture(means, variances, self.estimator_)
+            # some learners claim to be certain
+            floor = np.maximum(1e-6 * (residual**2).mean(axis=(0, 1)), 1e-300)
+            residual = residual / np.sqrt(np.maximum(variance, floor))
         now, then = residual[:, :-1], residual[:, 1:]
         power = np.sqrt((now**2).sum(axis=(0, 1)) * (then**2).sum(axis=(0, 1)))
         correlation = (now * then).sum(axis=(0, 1)) / np.where(power > 0, power, 1.0)
-        step = float(np.median(np.diff(few.times)[np.diff(few.times) > 0]))
+        step = float(np.median(time_steps(few)))
         self.noise_time_ = -step / np.log(np.clip(correlation, 1e-6, 1 - 1e-6))
 
     # -- forecasting ----------------------------------------------------------------------
@@ -262,7 +262,7 @@ class TrajectoryRegressor(DynamicsEstimator):
         rng: np.random.Generator,
     ) -> Prediction:
         means, variances = self._at(query)
-        prediction = Prediction(means.mean(axis=0))
+        prediction = Prediction(mean_of_members(means))
         if return_std or n_samples:
             _, variance = mixture(means, variances, self.estimator_)
             prediction.std = np.sqrt(variance) if return_std else None

@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from itertools import pairwise
 from numbers import Integral
 from typing import ClassVar, NamedTuple, Protocol
 
@@ -46,9 +47,12 @@ class _SimulationError(ValueError):
     """A step that went wrong: in which row of the states, and how ("... left the bounds")."""
 
     def __init__(self, row: int, reason: str) -> None:
-        super().__init__(f"the simulation of row {row} of states {reason}.")
+        super().__init__(row, reason)
         self.row = row
         self.reason = reason
+
+    def __str__(self) -> str:
+        return f"the simulation of row {self.row} of the states {self.reason}."
 
 
 class Environment(ABC):
@@ -142,7 +146,7 @@ class Environment(ABC):
         Raises
         ------
         ValueError
-            If a shape is wrong or the actions are not finite.
+            If a shape is wrong, the actions are not finite, or the simulation goes wrong.
         """
         s = self._checked_batch(states, "states")
         return self._step(s, self._clipped(actions, len(s), "actions"))
@@ -333,8 +337,8 @@ class Environment(ABC):
         n_workers = min(effective_n_jobs(n_jobs), len(starts))
         if n_workers == 1:
             return self._fly(starts, params, length, policy, numbers)
-        edges = np.linspace(0, len(starts), n_workers + 1).astype(int)
-        shares = [slice(a, b) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        edges = np.linspace(0, len(starts), n_workers + 1).astype(int).tolist()
+        shares = [slice(a, b) for a, b in pairwise(edges)]
         parts = Parallel(n_jobs=n_jobs)(
             delayed(self._fly)(starts[part], params[part], length, policy, numbers[part])
             for part in shares
@@ -371,10 +375,11 @@ class Environment(ABC):
                     row = int(np.argwhere(~np.isfinite(current))[0, 0])
                     raise _SimulationError(row, "left the finite numbers")
             except _SimulationError as error:
+                number, theta = numbers[flying[error.row]], gains[error.row].tolist()
                 raise ValueError(
-                    f"the simulation of episode {numbers[flying[error.row]]} {error.reason} at step "
-                    f"{t}: the step dt={self.dt} is too long for the params "
-                    f"{gains[error.row].tolist()}, or the initial state is too large."
+                    f"the simulation of episode {number} {error.reason} at step {t}: the step "
+                    f"dt={self.dt} is too long for the params {theta}, or the initial state is "
+                    "too large."
                 ) from error
             actions[flying, t] = applied
             states[flying, t + 1] = current

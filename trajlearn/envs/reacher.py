@@ -121,7 +121,7 @@ class Reacher(Environment):
 
     Examples
     --------
-    >>> from trajlearn.envs import Reacher
+    >>> from trajlearn.envs.reacher import Reacher
     >>> system = Reacher()
     >>> episodes = system.collect(3, 500, random_state=0)
     >>> episodes[0].states.shape, episodes[0].actions.shape
@@ -232,69 +232,97 @@ class Reacher(Environment):
         return _states(angles, velocities)
 
     def _draw_params(self, generator: Generator) -> NDArray[np.float64]:
-        return generator.uniform(*self.param_bounds.T)
+        low, high = self.param_bounds.T
+        return generator.uniform(low, high)
 
     def _step(
         self, states: NDArray[np.float64], actions: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        return self._simulator(states)(np.arange(len(states)), states, actions)
+        arm = _Arm(self._model())
+        angles, velocities = _coordinates(states)
+        for row in range(len(states)):
+            arm.start(angles[row], velocities[row])
+            angles[row], velocities[row] = arm.advance(actions[row], row)
+        return _checked(angles, velocities)
 
     def _simulator(self, starts: NDArray[np.float64]) -> _Simulator:
+        model = self._model()
+        arms = [_Arm(model) for _ in starts]
+        for arm, angles, velocities in zip(arms, *_coordinates(starts), strict=True):
+            arm.start(angles, velocities)
+
+        def advance(
+            rows: NDArray[np.intp], states: NDArray[np.float64], actions: NDArray[np.float64]
+        ) -> NDArray[np.float64]:
+            angles, velocities = np.empty((2, len(rows), N_JOINTS))
+            for k, row in enumerate(rows.tolist()):
+                angles[k], velocities[k] = arms[row].advance(actions[k], k)
+            return _checked(angles, velocities)
+
+        return advance
+
+    def _model(self) -> "mujoco.MjModel":
         import mujoco
 
-        return _Arms(mujoco.MjModel.from_xml_string(self.mjcf), starts)
+        return mujoco.MjModel.from_xml_string(self.mjcf)
 
 
-class _Arms:
-    """MuJoCo's arms, one for each episode of a batch."""
+class _Arm:
+    """MuJoCo's state of one arm, which counts the turns of a joint and remembers warnings."""
 
-    def __init__(self, model: "mujoco.MjModel", starts: NDArray[np.float64]) -> None:
+    def __init__(self, model: "mujoco.MjModel") -> None:
         import mujoco
 
-        cos, sin, velocities = np.hsplit(starts, 3)
-        off = np.abs(np.hypot(cos, sin) - 1.0) > 1e-3
-        if off.any():
-            row, joint = np.argwhere(off)[0]
-            raise ValueError(
-                f"(cos, sin) of {JOINTS[joint]} in row {row} of the states is "
-                f"({cos[row, joint]}, {sin[row, joint]}), which no angle has. Divide the pair by "
-                "its length, or pass the states in their own units if they were scaled."
-            )
-        self._mj_step = mujoco.mj_step
-        self._warning_names = [f.removeprefix("mjWARN_") for f in mujoco.mjtWarning.__members__]
-        self._model = model
+        self._model, self._data = model, mujoco.MjData(model)
+        self._step, self._reset = mujoco.mj_step, mujoco.mj_resetData
         self._substeps = round(CONTROL_STEP / PHYSICS_STEP)
-        self._data = [mujoco.MjData(model) for _ in starts]
-        # views that stay valid as the simulation goes on
-        self._qpos = [data.qpos for data in self._data]
-        self._qvel = [data.qvel for data in self._data]
-        self._ctrl = [data.ctrl for data in self._data]
-        self._warnings = [data.warning.number for data in self._data]
-        for row, angles in enumerate(np.arctan2(sin, cos)):
-            self._qpos[row][:] = angles
-            self._qvel[row][:] = velocities[row]
+        # views that follow the data
+        self._angles, self._velocities = self._data.qpos, self._data.qvel
+        self._torques, self._warnings = self._data.ctrl, self._data.warning.number
 
-    def __call__(
-        self,
-        rows: NDArray[np.intp],
-        states: NDArray[np.float64],
-        actions: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
-        angles, velocities = np.empty((2, len(rows), N_JOINTS))
-        for k, row in enumerate(rows.tolist()):
-            self._ctrl[row][:] = actions[k]
-            self._mj_step(self._model, self._data[row], nstep=self._substeps)
-            angles[k], velocities[k] = self._qpos[row], self._qvel[row]
-            if any(self._warnings[row].tolist()):
-                numbers = zip(self._warning_names, self._warnings[row], strict=False)
-                raised = ", ".join(name for name, number in numbers if number)
-                raise _SimulationError(k, f"made MuJoCo warn ({raised})")
-        fast = ~(np.abs(velocities) <= MAX_SPEED).all(axis=1)
-        if fast.any():
-            reason = f"moved a joint faster than {MAX_SPEED:g} rad/s"
-            raise _SimulationError(int(np.argmax(fast)), reason)
-        return _states(angles, velocities)
+    def start(self, angles: NDArray[np.float64], velocities: NDArray[np.float64]) -> None:
+        self._reset(self._model, self._data)
+        self._angles[:], self._velocities[:] = angles, velocities
+
+    def advance(
+        self, action: NDArray[np.float64], row: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Angles and velocities, as views, after one control step; ``row`` is for messages."""
+        self._torques[:] = action
+        self._step(self._model, self._data, nstep=self._substeps)
+        if any(self._warnings.tolist()):
+            from mujoco import mjtWarning
+
+            raised = [mjtWarning(i).name for i in np.flatnonzero(self._warnings)]
+            names = ", ".join(name.removeprefix("mjWARN_") for name in raised)
+            raise _SimulationError(row, f"made MuJoCo warn ({names})")
+        return self._angles, self._velocities
+
+
+def _coordinates(
+    states: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Angles and velocities of states (n, 15)."""
+    cos, sin, velocities = np.hsplit(states, 3)
+    off = np.abs(np.hypot(cos, sin) - 1.0) > 1e-3
+    if off.any():
+        row, joint = np.argwhere(off)[0]
+        raise ValueError(
+            f"(cos, sin) of {JOINTS[joint]} in row {row} of the states is "
+            f"({cos[row, joint]}, {sin[row, joint]}), which no angle has. Divide the pair by "
+            "its length, or pass the states in their own units if they were scaled."
+        )
+    return np.arctan2(sin, cos), velocities.copy()
 
 
 def _states(angles: NDArray[np.float64], velocities: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([np.cos(angles), np.sin(angles), velocities], axis=-1)
+
+
+def _checked(angles: NDArray[np.float64], velocities: NDArray[np.float64]) -> NDArray[np.float64]:
+    """States of the angles and velocities (n, 5), which must be plausible."""
+    fast = ~(np.abs(velocities) <= MAX_SPEED).all(axis=1)
+    if fast.any():
+        reason = f"moved a joint faster than {MAX_SPEED:g} rad/s"
+        raise _SimulationError(int(np.argmax(fast)), reason)
+    return _states(angles, velocities)

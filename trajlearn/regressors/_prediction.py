@@ -155,11 +155,12 @@ def mixture(means: Floats, variances: Floats) -> tuple[Floats, Floats]:
 
     Members are added one after another: numpy's `mean` adds a single row in another order.
     """
-    mean = _mean_of_members(means)
-    return mean, _mean_of_members(variances) + _mean_of_members((means - mean) ** 2)
+    mean = mean_of_members(means)
+    return mean, mean_of_members(variances) + mean_of_members((means - mean) ** 2)
 
 
-def _mean_of_members(values: Floats) -> Floats:
+def mean_of_members(values: Floats) -> Floats:
+    """Mean over the first axis, the same bits however many rows follow."""
     total = values[0].copy()
     for member in values[1:]:
         total += member

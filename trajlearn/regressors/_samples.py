@@ -41,7 +41,7 @@ class Rows:
         Raises
         ------
         ValueError
-            If a weight is negative or no row is left.
+            If a weight is negative.
         """
         if self.weight is None:
             return self
@@ -49,8 +49,6 @@ class Rows:
             raise ValueError(
                 "sample_weight has negative values; weights count how often a row is seen."
             )
-        if not self.weight.any():
-            raise ValueError("sample_weight is zero everywhere; give at least one row some weight.")
         return self.take(self.weight > 0)
 
     def merged(self, limit: int) -> Self:

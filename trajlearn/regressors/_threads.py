@@ -13,7 +13,8 @@ _WORTH_THREADS = 1e9
 def threads_for(flops: float) -> Iterator[None]:
     """Limit torch to one thread while steps are small; restore the setting afterwards."""
     before = torch.get_num_threads()
-    limited = before > 1 and flops < _WORTH_THREADS
+    # also when torch reports 1: inside an outer limit its MKL may still have more
+    limited = flops < _WORTH_THREADS
     if limited:
         torch.set_num_threads(1)
     try:

@@ -184,9 +184,9 @@ class GPRegressor(RegressorMixin, BaseEstimator):
         rows, y = validate_data(
             self, X, y, multi_output=True, y_numeric=True, dtype=np.float64, order="C"
         )
-        y = check_array(y, dtype=np.float64, ensure_2d=False, input_name="y")
-        self._y_ndim = y.ndim
-        targets: Floats = np.ascontiguousarray(y.reshape(len(y), -1).T)
+        values: Floats = check_array(y, dtype=np.float64, ensure_2d=False, input_name="y")
+        self._y_ndim = values.ndim
+        targets = np.ascontiguousarray(values.reshape(len(rows), -1).T)
         self.input_offset_, self.input_scale_ = _input_standardisation(rows)
         self.target_mean_, self.target_scale_ = _target_standardisation(targets)
         self.is_sparse_ = len(rows) > self.max_exact
@@ -194,7 +194,8 @@ class GPRegressor(RegressorMixin, BaseEstimator):
         targets = (targets - self.target_mean_[:, None]) / self.target_scale_[:, None]
 
         draws = Draws.make(check_random_state(self.random_state), inputs.shape, self.n_restarts)
-        with threadpool_limits(1), threads_for(0.0):
+        # torch first: its own BLAS is out of threadpoolctl's sight, but its thread count is not
+        with threads_for(0.0), threadpool_limits(1):
             found = [self._search(inputs, target, draws) for target in targets]
             self._set_hyperparameters([minimum for minimum, _ in found])
             self.basis_ = np.stack([basis for _, basis in found[: None if self.is_sparse_ else 1]])

@@ -79,7 +79,7 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
         Hold out `validation_fraction` of the rows (of the groups, where `groups` is given) and
         keep each member's best weights there.
     validation_fraction : float, default=0.1
-    patience : int, default=10
+    patience : int, default=20
         Evaluations (a hundredth of the steps apart) without improvement in any member before
         training ends.
     nll_beta : float, default=0.5
@@ -123,8 +123,8 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
     >>> import numpy as np
     >>> from trajlearn import MLPEnsembleRegressor
     >>> X = np.linspace(-1, 1, 200)[:, None]
-    >>> model = MLPEnsembleRegressor(hidden_layer_sizes=(64, 64), learning_rate=0.01, random_state=0)
-    >>> model.fit(X, np.sin(3 * X[:, 0])).score(X, np.sin(3 * X[:, 0])) > 0.99
+    >>> model = MLPEnsembleRegressor(hidden_layer_sizes=(64, 64), random_state=0)
+    >>> model.fit(X, np.sin(3 * X[:, 0])).score(X, np.sin(3 * X[:, 0])) > 0.98
     True
     """
 
@@ -171,7 +171,7 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
         bootstrap: Literal[False, "row", "group"] = False,
         early_stopping: bool = False,
         validation_fraction: float = 0.1,
-        patience: int = 10,
+        patience: int = 20,
         nll_beta: float = 0.5,
         device: str = "cpu",
         warm_start: bool = False,
@@ -321,8 +321,8 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
         first = not hasattr(self, "coefs_")
         rows = self._validated(X, y, sample_weight, reset=first)
         # the same seed must not give every pass the same order of rows
-        passed = 0 if first else int(self._moments[0])
-        rng = np.random.default_rng([*self._seed(), passed])
+        passed = [] if first else [int(self._moments[0])]
+        rng = np.random.default_rng(self._seed() + passed)
         self._set_target_scale(rows, keep=not first)
         batches = row_batches(rows, None, self._to_tensors(), self.n_members, self.batch_size, rng)
         n_steps = -(-len(rows) // self.batch_size)

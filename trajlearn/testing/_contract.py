@@ -24,7 +24,7 @@ Check = Callable[[Case], None]
 def checks(case: Case) -> Iterator[tuple[str, Callable[[], None]]]:
     """Name and function of every check for the kind of estimator at hand."""
     special = (_forecasts, _uncertainty, _scores) if case.forecasts else (_rewards,)
-    for module in (_fitting, *special, _information, _errors, _selection):
+    for module in (_fitting, _information, *special, _errors, _selection):
         for name, check in list(vars(module).items()):
             if name.startswith("check_") and check.__module__ == module.__name__:
                 yield name, partial(_run, name, check, case)

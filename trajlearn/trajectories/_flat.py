@@ -37,7 +37,7 @@ def assemble(
     group: Sequence[Any] | None = None,
     context: Mapping[str, Sequence[Any]] | None = None,
 ) -> TrajectoryDataset:
-    """Validate flat arrays, episode after episode, and make a dataset of them.
+    """Validate flat arrays, episode after episode, and make a dataset of them (not of copies).
 
     Parameters
     ----------
@@ -77,7 +77,7 @@ def assemble(
     ):
         if value is None:
             continue
-        array = np.array(value, dtype=np.float64, order="C")
+        array = np.ascontiguousarray(value, dtype=np.float64)
         if array.ndim != ndim or len(array) != rows or (ndim == 2 and not array.shape[1]):
             raise InvalidEpisodeError(
                 f"{name} has shape {array.shape}; the episodes need {rows} rows."

@@ -98,11 +98,29 @@ class Relabeler(BaseEstimator):
         }.get(block, (block,))
 
     def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
-        """Names of the columns of a row."""
+        """Names of the columns of a row.
+
+        Parameters
+        ----------
+        input_features : None
+            Ignored; the names come from the episodes.
+
+        Returns
+        -------
+        ndarray of str of shape (n_features,)
+        """
         return self.layout_.feature_names
 
     def context_rows(self, ds: TrajectoryDataset) -> Floats:
-        """One-hot context of each episode (n, number of categories).
+        """One-hot context of each episode.
+
+        Parameters
+        ----------
+        ds : TrajectoryDataset
+
+        Returns
+        -------
+        ndarray of shape (n, n_categories)
 
         Raises
         ------
@@ -117,14 +135,27 @@ class Relabeler(BaseEstimator):
             unseen = ~np.isin(values, categories)
             if unseen.any():
                 raise ValueError(
-                    f"episode {ds.ids[unseen][0]}: context {key!r} is {values[unseen][0]!r}, which "
+                    f"episode {ds.ids[unseen][0]}: context {key!r} is {values[unseen][0].item()!r}, which "
                     f"fit did not see (it saw {categories.tolist()})."
                 )
             blocks.append((values[:, None] == categories[None, :]).astype(np.float64))
         return np.concatenate(blocks, axis=1)
 
     def rows(self, ds: TrajectoryDataset, episode: Ints, begin: Ints, end: Ints) -> Floats:
-        """Rows from the states `begin` to `end` (rows of ``ds.states``) of the given episodes."""
+        """Rows of pairs of states.
+
+        Parameters
+        ----------
+        ds : TrajectoryDataset
+        episode : ndarray of shape (n_rows,)
+            Episode of each pair.
+        begin, end : ndarray of shape (n_rows,)
+            Its earlier and its later state, as rows of ``ds.states``.
+
+        Returns
+        -------
+        ndarray of shape (n_rows, n_features)
+        """
         out = np.empty((len(begin), self.layout_.width))
         for block, columns in self.layout_.items():
             out[:, columns] = self._values(ds, block, episode, begin, end)
@@ -133,6 +164,7 @@ class Relabeler(BaseEstimator):
     def _values(
         self, ds: TrajectoryDataset, block: str, episode: Ints, begin: Ints, end: Ints
     ) -> Floats:
+        # take() copies whole rows, several times as fast as indexing with [rows]
         if block == "state":
             return ds.states.take(begin, axis=0)
         if block in ("horizon", "dt"):

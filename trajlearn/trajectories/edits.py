@@ -33,6 +33,15 @@ def truncate(ds: TrajectoryDataset, max_steps: int) -> TrajectoryDataset:
 
     An episode cut short is no longer `terminated`; everything else is kept.
 
+    Parameters
+    ----------
+    ds : TrajectoryDataset
+    max_steps : int
+
+    Returns
+    -------
+    TrajectoryDataset
+
     Examples
     --------
     >>> ds = TrajectoryDataset.from_arrays([[[0.0]] * 4, [[0.0]] * 9])
@@ -53,6 +62,17 @@ def window(ds: TrajectoryDataset, length: int, *, stride: int | None = None) -> 
     that reaches the end of a terminated episode is `terminated`. Windows are called
     ``"<id>:<start>"``. Where the dataset has no `group`, the windows get the id of their episode
     as group, so that group splits never part them.
+
+    Parameters
+    ----------
+    ds : TrajectoryDataset
+    length : int
+    stride : int, optional
+        Steps from the start of a window to that of the next; default `length`.
+
+    Returns
+    -------
+    TrajectoryDataset
 
     Raises
     ------
@@ -81,6 +101,15 @@ def window(ds: TrajectoryDataset, length: int, *, stride: int | None = None) -> 
 
 def select_states(ds: TrajectoryDataset, names: Sequence[str]) -> TrajectoryDataset:
     """Keep the named state columns, in that order.
+
+    Parameters
+    ----------
+    ds : TrajectoryDataset
+    names : sequence of str
+
+    Returns
+    -------
+    TrajectoryDataset
 
     Raises
     ------
@@ -127,6 +156,10 @@ def add_noise(
         What the spread is: standard deviation, or maximum minus minimum.
     random_state : int, RandomState instance or None
 
+    Returns
+    -------
+    TrajectoryDataset
+
     Examples
     --------
     >>> import numpy as np
@@ -149,6 +182,14 @@ def concatenate(ds: TrajectoryDataset, *others: TrajectoryDataset) -> Trajectory
     """Episodes of several datasets, one after the other.
 
     Ids are kept if they still tell all episodes apart; else the episodes are numbered.
+
+    Parameters
+    ----------
+    ds, *others : TrajectoryDataset
+
+    Returns
+    -------
+    TrajectoryDataset
 
     Raises
     ------

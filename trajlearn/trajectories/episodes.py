@@ -77,7 +77,16 @@ class EpisodeRelabeler(Relabeler):
         return self.rows(ds, episode, first, first), self.targets(ds), episode
 
     def targets(self, ds: TrajectoryDataset) -> Floats:
-        """Mean reward per step of each episode (n,)."""
+        """Mean reward per step of each episode.
+
+        Parameters
+        ----------
+        ds : TrajectoryDataset
+
+        Returns
+        -------
+        ndarray of shape (n,)
+        """
         return episode_rewards(
             ds, self.reward, horizon=self.horizon, terminal_reward=self.terminal_reward
         )

@@ -28,6 +28,15 @@ def decimate(ds: TrajectoryDataset, k: int) -> TrajectoryDataset:
     changes first, and stretches of less than `k` steps are left out; all episodes are then
     called ``"<id>:<start>"``, and the group (the id, if there was none) keeps them together.
 
+    Parameters
+    ----------
+    ds : TrajectoryDataset
+    k : int
+
+    Returns
+    -------
+    TrajectoryDataset
+
     Raises
     ------
     InvalidEpisodeError
@@ -76,6 +85,16 @@ def resample(ds: TrajectoryDataset, dt: float) -> TrajectoryDataset:
 
     A new step never spans a change of theta: an episode where one would is split at its
     changes, as in `decimate`, each stretch with a grid from its own beginning.
+
+    Parameters
+    ----------
+    ds : TrajectoryDataset
+    dt : float
+        New time step, in the unit of `times`.
+
+    Returns
+    -------
+    TrajectoryDataset
 
     Raises
     ------

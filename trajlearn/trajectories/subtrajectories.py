@@ -25,8 +25,8 @@ class SubtrajectoryRelabeler(Relabeler):
     Parameters
     ----------
     max_rows : int or None, default=100_000
-        Rows to draw (without repeats if uniform). None, or at least as many as there are
-        pairs with both schemes uniform: every pair once.
+        Rows to draw (without repeats if uniform), at most as many as there are pairs. None, or
+        at least as many as there are pairs with both schemes uniform: every pair once.
     starts : {"uniform", "early", "first"}, default="uniform"
         How the start is drawn. "early": 30 % at s_0, the rest at L u^2 with u ~ U(0, 1).
         "first": s_0 only.
@@ -104,7 +104,8 @@ class SubtrajectoryRelabeler(Relabeler):
         if self.max_rows is None or (uniform and self.max_rows >= index.total):
             pairs = index.pairs(np.arange(index.total))
         else:
-            pairs = self._draw(index, self.max_rows, rng, replace=False)
+            n_rows = min(self.max_rows, index.total)
+            pairs = self._draw(index, n_rows, rng, replace=False)
         return self._rows(ds, index, pairs)
 
     def _draw(
@@ -128,6 +129,14 @@ class SubtrajectoryRelabeler(Relabeler):
         """Function ``draw(n_rows, rng)`` of fresh rows, targets and the episode of each row.
 
         Call `fit` first. Rows may repeat; `n_pairs` counts what there is to draw from.
+
+        Parameters
+        ----------
+        X : TrajectoryDataset or list of Trajectory
+
+        Returns
+        -------
+        callable
         """
         ds = as_dataset(X)
         index = PairIndex(Stretches.of(ds), self.max_horizon)
@@ -138,7 +147,16 @@ class SubtrajectoryRelabeler(Relabeler):
         return draw
 
     def n_pairs(self, X: Any) -> int:
-        """Number of pairs (s_t, s_{t+h}) in the episodes."""
+        """Number of pairs (s_t, s_{t+h}) in the episodes.
+
+        Parameters
+        ----------
+        X : TrajectoryDataset or list of Trajectory
+
+        Returns
+        -------
+        int
+        """
         return PairIndex(Stretches.of(as_dataset(X)), self.max_horizon).total
 
     def stream(
@@ -152,6 +170,11 @@ class SubtrajectoryRelabeler(Relabeler):
         batch_size : int
         random_state : int, RandomState, Generator or None
             None takes the relabeler's own.
+
+        Yields
+        ------
+        rows, targets, episode : ndarray
+            As from `sampler`.
         """
         ds = as_dataset(X)
         draw = self.fit(ds).sampler(ds)

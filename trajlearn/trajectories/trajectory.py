@@ -176,7 +176,12 @@ class Trajectory:
         return f"Trajectory({', '.join(parts)})"
 
     def to_dict(self) -> dict[str, Any]:
-        """Fields by name, as the constructor takes them."""
+        """Fields by name, as the constructor takes them.
+
+        Returns
+        -------
+        dict
+        """
         fields = {name: getattr(self, name) for name in self.__slots__}
         return fields | {"context": dict(self.context)}
 

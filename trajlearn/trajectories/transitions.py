@@ -78,6 +78,16 @@ class TransitionRelabeler(Relabeler):
     def fit(self, X: Any, y: None = None) -> Self:
         """Learn the layout, the categories of the context, and the common time step.
 
+        Parameters
+        ----------
+        X : TrajectoryDataset or list of Trajectory
+        y : None
+            Ignored.
+
+        Returns
+        -------
+        self
+
         Raises
         ------
         MixedSamplingError
