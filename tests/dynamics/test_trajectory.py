@@ -201,7 +201,7 @@ def test_a_shorter_training_horizon_counts():
 
 def test_past_an_irregular_log_there_are_no_times():
     ds = oscillators(5, 0)
-    with pytest.raises(ValueError, match="varies in episode 0.*predict_trajectory"):
+    with pytest.raises(ValueError, match=r"varies in episode 0.*predict_trajectory"):
         small().fit(ds).predict(ds, start=28, horizon=5)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 from sklearn.model_selection import GroupKFold, check_cv
 from threadpoolctl import threadpool_limits
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from trajlearn.dynamics import Forecast
 from trajlearn.evaluation._horizons import errors_at, predicted_states, whole_steps

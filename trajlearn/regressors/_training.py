@@ -160,7 +160,7 @@ def _progress(settings: Settings) -> AbstractContextManager[Any]:
     """Progress bar, or None."""
     if not settings.verbose:
         return nullcontext()
-    from tqdm.auto import tqdm
+    from tqdm import tqdm
 
     bar: AbstractContextManager[Any] = tqdm(total=settings.n_steps, desc="training", unit="step")
     return bar

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
 from sklearn.utils import Tags, check_random_state
+from sklearn.utils.validation import check_is_fitted
 
 from trajlearn.exceptions import MissingFieldError
 from trajlearn.trajectories._layout import Layout
@@ -109,6 +110,7 @@ class Relabeler(BaseEstimator):
         -------
         ndarray of str of shape (n_features,)
         """
+        check_is_fitted(self, "layout_")
         return self.layout_.feature_names
 
     def context_rows(self, ds: TrajectoryDataset) -> Floats:
@@ -135,8 +137,9 @@ class Relabeler(BaseEstimator):
             unseen = ~np.isin(values, categories)
             if unseen.any():
                 raise ValueError(
-                    f"episode {ds.ids[unseen][0]}: context {key!r} is {values[unseen][0].item()!r}, which "
-                    f"fit did not see (it saw {categories.tolist()})."
+                    f"episode {ds.ids[unseen][0]}: context {key!r} is "
+                    f"{values[unseen][0].item()!r}, which fit did not see (it saw "
+                    f"{categories.tolist()})."
                 )
             blocks.append((values[:, None] == categories[None, :]).astype(np.float64))
         return np.concatenate(blocks, axis=1)

@@ -93,9 +93,8 @@ class TransitionRelabeler(Relabeler):
         MixedSamplingError
             If the time step varies and is not an input.
         """
-        ds = as_dataset(X)
-        super().fit(ds)
-        self.dt_ = None if "dt" in self.layout_ else uniform_step(ds)
+        super().fit(X)
+        self.dt_ = None if "dt" in self.layout_ else uniform_step(as_dataset(X))
         return self
 
     def _resample(
