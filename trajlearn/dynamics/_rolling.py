@@ -1,0 +1,183 @@
+"""What models of one step share: the inputs of a roll-out and where its actions come from."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trajlearn.dynamics._dynamics import DIVERGENCE_RANGES, DynamicsEstimator
+from trajlearn.dynamics._query import Query
+from trajlearn.dynamics._rollout import InputRows, Limits
+from trajlearn.exceptions import MissingFieldError, MixedSamplingError
+from trajlearn.trajectories import TrajectoryDataset
+from trajlearn.trajectories._layout import Layout
+from trajlearn.trajectories.times import uniform_step
+
+__all__ = ["RollingEstimator"]
+
+Floats = NDArray[np.float64]
+
+
+class RollingEstimator(DynamicsEstimator):
+    """Estimator of the next state that is applied again and again."""
+
+    inputs: str | Sequence[str]
+    target: str
+    policy: Any
+    rollout_actions: str
+    clip_states: float | None
+
+    # -- rows -----------------------------------------------------------------------------
+
+    def _layout_of_rows(self, n_features: int, n_targets: int) -> Layout:
+        if n_features < n_targets:
+            raise ValueError(
+                f"rows have n_features = {n_features}, but {n_targets} target(s) need at least "
+                f"{n_targets} columns: the {n_targets} state(s), then actions or params."
+            )
+        rest = self.inputs if isinstance(self.inputs, str) else "action"
+        return Layout.of_rows(n_features, n_targets, (rest,))
+
+    def _change(self, rows: Floats, targets: Floats) -> Floats:
+        return targets - rows[:, self.layout_["state"]] if self.target == "change" else targets
+
+    def _learning_targets(self, rows: Floats, targets: Floats) -> tuple[Floats, Floats | None]:
+        return self._change(rows, targets) / self.target_scale_, None
+
+    def _restore(self, rows: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:
+        means = means * self.target_scale_
+        if self.target == "change":
+            means = means + rows[:, self.layout_["state"]]
+        return means, variances * self.target_scale_**2
+
+    # -- roll-outs ------------------------------------------------------------------------
+
+    def _source(self, ds: TrajectoryDataset, actions: str, policy: Any) -> tuple[str, Any]:
+        """Where the actions come from: "none", "logged" or "policy", and the policy."""
+        policy = self.policy if policy is None else policy
+        if "action" not in self.layout_:
+            return "none", None
+        choice = self.rollout_actions if actions == "auto" else actions
+        if choice == "auto":
+            choice = "logged" if policy is None else "policy"
+        if choice == "policy" and policy is None:
+            raise ValueError(
+                "actions='policy' needs a policy: give policy= here or in the constructor, or "
+                "roll out with actions='logged'."
+            )
+        if choice == "logged" and ds.actions is None:
+            raise MissingFieldError(
+                f"{type(self).__name__} needs actions to roll out, but the episodes have none. "
+                "Give policy=, or a model with inputs='params'."
+            )
+        if choice == "logged":
+            block = self.layout_["action"]
+            if len(ds.action_names) != block.stop - block.start:
+                raise ValueError(
+                    f"the episodes have {len(ds.action_names)} actions, the model was fitted on "
+                    f"{block.stop - block.start}."
+                )
+        return choice, policy
+
+    def _reads_logged_future(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
+        return self._source(ds, actions, policy)[0] == "logged" or "references" in self.layout_
+
+    def _check_time_step(self, ds: TrajectoryDataset) -> None:
+        if "dt" in self.layout_ or self.dt_ is None:
+            return
+        dt = uniform_step(ds)
+        if abs(dt - self.dt_) > 1e-3 * self.dt_:
+            raise MixedSamplingError(
+                f"the model was fitted on steps of {self.dt_:g}, the episodes have steps of "
+                f"{dt:g}. "
+                'Resample them (ds.resample), or fit with "dt" among inputs=.'
+            )
+
+    def _limits(self) -> Limits:
+        low, high = self.state_range_
+        width = np.where(high > low, high - low, 1.0)
+        centre = (low + high) / 2
+        clip = None
+        if self.clip_states is not None:
+            clip = (centre - self.clip_states * width / 2, centre + self.clip_states * width / 2)
+        return Limits(clip, centre, DIVERGENCE_RANGES * width)
+
+    def _input_rows(self, query: Query, source: str, policy: Any, *, copies: int) -> InputRows:
+        """Rows of inputs at each step of a roll-out; only known signals and actions enter."""
+        ds = query.ds
+        blocks: dict[str, Floats] = {}
+        if "params" in self.layout_ or source == "policy":
+            theta = self._theta(query)
+        if "context" in self.layout_:
+            blocks["context"] = self.relabeler_.context_rows(ds)
+        if "references" in self.layout_:
+            ds.require("references", by=f"{type(self).__name__} (fitted with references)")
+            assert ds.references is not None
+            references = query.future(ds.references, steps=False)
+        logged = None
+        if source == "logged":
+            assert ds.actions is not None  # _source has checked
+            logged = query.future(ds.actions, steps=True)
+        times = np.concatenate([query.initial_times[:, None], query.times], axis=1)
+        times = _filled(times)
+
+        def inputs(states: Floats, k: int) -> Floats:
+            now: dict[str, Floats] = {"state": states}
+            if logged is not None:
+                blocks["action"] = logged[:, k]
+            elif source == "policy":
+                by_copy = np.tile(theta[:, k], (copies, 1))
+                actions = policy(states, by_copy, np.tile(times[:, k], copies))
+                now["action"] = _checked_actions(actions, self.layout_["action"], states)
+            if "params" in self.layout_:
+                blocks["params"] = theta[:, k]
+            if "dt" in self.layout_:
+                blocks["dt"] = (times[:, k + 1] - times[:, k])[:, None]
+            if "references" in self.layout_:
+                blocks["references"] = np.concatenate(
+                    [references[:, k], references[:, k + 1]], axis=1
+                )
+            for block, values in blocks.items():
+                now[block] = values if copies == 1 else np.tile(values, (copies, 1))
+            return self.layout_.assemble(now)
+
+        return inputs
+
+    def _theta(self, query: Query) -> Floats:
+        """theta_t along the roll-out (n, H, p)."""
+        params = query.ds.step_params if query.ds.params_vary else None
+        if params is None:
+            return np.repeat(query.params()[:, None], query.n_steps, axis=1)
+        return query.future(params, steps=True)
+
+    def _time_grid(self, horizons: Floats) -> tuple[Floats, NDArray[np.intp]]:
+        if "dt" in self.layout_:
+            return super()._time_grid(horizons)
+        dt = 1.0 if self.dt_ is None else self.dt_
+        steps = np.round(horizons / dt).astype(np.intp)
+        if (np.abs(steps * dt - horizons) > 1e-3 * dt).any():
+            raise ValueError(
+                f"horizons must be multiples of the time step {dt:g} of a one-step model; "
+                "TrajectoryRegressor predicts any."
+            )
+        return np.arange(1, steps[-1] + 1) * dt, steps - 1
+
+
+def _filled(times: Floats) -> Floats:
+    """Replace the padding at the end of a row by its last time."""
+    known = np.where(np.isfinite(times), np.arange(times.shape[1]), 0)
+    return np.take_along_axis(times, np.maximum.accumulate(known, axis=1), axis=1)
+
+
+def _checked_actions(actions: Any, block: slice, states: Floats) -> Floats:
+    actions = np.asarray(actions, dtype=np.float64)
+    want = (len(states), block.stop - block.start)
+    if actions.shape != want:
+        raise ValueError(
+            f"the policy returned actions of shape {actions.shape} for {len(states)} states; "
+            f"expected {want}."
+        )
+    if not np.isfinite(actions).all():
+        raise ValueError("the policy returned NaN or infinite actions for finite states.")
+    return actions
