@@ -22,7 +22,9 @@ _MODULE_OF = {
     "OneStepRegressor": "dynamics",
     "TrajectoryRegressor": "dynamics",
     "Cartpole": "envs",
+    "Reacher": "envs",
     "LinearFeedback": "policies",
+    "PID": "policies",
     "cross_val_forecast": "evaluation",
     "cross_validate_horizons": "evaluation",
     "horizon_errors": "evaluation",
@@ -30,6 +32,16 @@ _MODULE_OF = {
     "reward_errors": "evaluation",
     "summarise": "evaluation",
     "load": "_persistence",
+    "plot_forecast": "plotting",
+    "plot_horizon_errors": "plotting",
+    "plot_reward_table": "plotting",
+    "check_dynamics_estimator": "testing",
+    "DivergenceWarning": "exceptions",
+    "HorizonWarning": "exceptions",
+    "InvalidEpisodeError": "exceptions",
+    "MissingFieldError": "exceptions",
+    "MixedSamplingError": "exceptions",
+    "UnknownFileError": "exceptions",
 }
 
 __all__ = ["__version__", *_MODULE_OF]

@@ -158,7 +158,7 @@ class PID:
     Examples
     --------
     >>> import numpy as np
-    >>> from trajlearn.policies import PID
+    >>> from trajlearn import PID
     >>> angle, velocity, target = 0.3, 2.0, 0.5
     >>> state = np.array([[np.cos(angle), np.sin(angle), velocity]])
     >>> PID()(state, np.array([[0.4, 1.0, target]]), np.zeros(1))

@@ -2,5 +2,6 @@
 
 from trajlearn.envs.base import Environment
 from trajlearn.envs.cartpole import Cartpole
+from trajlearn.envs.reacher import Reacher
 
-__all__ = ["Cartpole", "Environment"]
+__all__ = ["Cartpole", "Environment", "Reacher"]

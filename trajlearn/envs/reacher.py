@@ -121,7 +121,7 @@ class Reacher(Environment):
 
     Examples
     --------
-    >>> from trajlearn.envs.reacher import Reacher
+    >>> from trajlearn import Reacher
     >>> system = Reacher()
     >>> episodes = system.collect(3, 500, random_state=0)
     >>> episodes[0].states.shape, episodes[0].actions.shape
