@@ -72,21 +72,26 @@ def episodes(task: str, seed: int) -> tuple[TrajectoryDataset, TrajectoryDataset
 
 def mirrored(ds: TrajectoryDataset) -> TrajectoryDataset:
     """The episodes and their mirror images: cartpole under linear feedback is odd in the state."""
-    image = TrajectoryDataset.from_arrays(
-        [-episode.states for episode in ds],
-        actions=[-episode.actions for episode in ds],
+    return _flipped(ds, np.ones(len(ds))).concatenate(_flipped(ds, -np.ones(len(ds))))
+
+
+def folded(ds: TrajectoryDataset) -> TrajectoryDataset:
+    """Each episode or its mirror image, whichever begins with the pole to the right.
+
+    For direct reward models. Both images together would mislead a Gaussian process: they share
+    theta and reward, so that noise-free interpolation over theta alone explains the data best.
+    """
+    return _flipped(ds, np.array([np.sign(episode.states[0, 2]) or 1.0 for episode in ds]))
+
+
+def _flipped(ds: TrajectoryDataset, signs: np.ndarray) -> TrajectoryDataset:
+    return TrajectoryDataset.from_arrays(
+        [sign * episode.states for sign, episode in zip(signs, ds, strict=True)],
+        actions=[sign * episode.actions for sign, episode in zip(signs, ds, strict=True)],
         params=ds.params,
         times=[episode.times for episode in ds],
         **ds.names,
     )
-    plain = TrajectoryDataset.from_arrays(
-        [episode.states for episode in ds],
-        actions=[episode.actions for episode in ds],
-        params=ds.params,
-        times=[episode.times for episode in ds],
-        **ds.names,
-    )
-    return plain.concatenate(image)
 
 
 # -- models ---------------------------------------------------------------------------------------
@@ -98,7 +103,7 @@ def build(task: str, family: str, config: Config, mode: str, seed: int) -> Any:
     """Estimator of a family with a configuration (None: the library's defaults)."""
     env = environment(task)
     steps = {"estimator__max_steps": MAX_STEPS[mode]}
-    settings = {key: value for key, value in config.items() if key != "mirror"}
+    settings = {key: value for key, value in config.items() if key != "symmetry"}
     if family == "GP":
         return DirectRewardGP(reward=env.reward, random_state=seed).set_params(**settings)
     if family == "NN":
@@ -122,15 +127,24 @@ CANDIDATES: dict[str, list[Config]] = {
 
 
 def candidates(task: str, family: str) -> list[Config]:
-    """Four configurations for every family: two settings, with and without mirrored episodes."""
+    """Four configurations for every family: two settings, with and without the symmetry."""
     return [
-        config | {"mirror": mirror} for mirror in (False, True) for config in CANDIDATES[family]
+        config | {"symmetry": symmetry}
+        for symmetry in (False, True)
+        for config in CANDIDATES[family]
     ]
 
 
-def prepared(ds: TrajectoryDataset, config: Config) -> TrajectoryDataset:
+def for_training(ds: TrajectoryDataset, family: str, config: Config) -> TrajectoryDataset:
     """Training episodes as a configuration wants them."""
-    return mirrored(ds) if config.get("mirror") else ds
+    if not config.get("symmetry"):
+        return ds
+    return folded(ds) if family in ("GP", "NN") else mirrored(ds)
+
+
+def for_prediction(ds: TrajectoryDataset, family: str, config: Config) -> TrajectoryDataset:
+    """Episodes to predict as a configuration wants them."""
+    return folded(ds) if config.get("symmetry") and family in ("GP", "NN") else ds
 
 
 # -- cells ----------------------------------------------------------------------------------------
@@ -173,10 +187,11 @@ def cell(task: str, settings: str, family: str, mode: str, seed: int) -> list[di
         if key not in models:
             began = time.perf_counter()
             model = make(task, settings, family, chosen[row], mode, seed)
-            model.fit(prepared(train, chosen[row]))
+            model.fit(for_training(train, family, chosen[row]))
             models[key] = model, time.perf_counter() - began
         model, seconds = models[key]
-        estimate = predicted(model, test, env.reward, actions)
+        shown = for_prediction(test, family, chosen[row])
+        estimate = predicted(model, shown, env.reward, actions)
         rows.append(record(settings, row, seed, truth, estimate, tuning + seconds, chosen[row]))
     return rows
 
@@ -216,9 +231,11 @@ def chosen_configs(
     tried = candidates(task, family)
     scores: dict[str, list[float]] = {row: [] for row in rows}
     for config in tried:
-        model = build(task, family, config, mode, seed).fit(prepared(kept, config))
+        model = build(task, family, config, mode, seed)
+        model.fit(for_training(kept, family, config))
+        shown = for_prediction(held, family, config)
         for row, actions in rows.items():
-            estimate = predicted(model, held, reward, actions)
+            estimate = predicted(model, shown, reward, actions)
             scores[row].append(float(np.mean((estimate - truth) ** 2)))
     best = {row: tried[int(np.nanargmin(scores[row]))] for row in rows}
     return best, time.perf_counter() - began

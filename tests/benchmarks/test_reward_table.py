@@ -35,6 +35,17 @@ def test_mirror_images_obey_the_same_dynamics(small):
     np.testing.assert_allclose(again[0].states, image.states, rtol=1e-9, atol=1e-12)
 
 
+def test_folding_keeps_rewards_and_forgets_the_side(small):
+    train, _ = reward_table.episodes("cartpole", 0)
+    env = reward_table.environment("cartpole")
+    once = reward_table.folded(train)
+    assert (once.states[once.offsets[:-1], 2] >= 0).all()
+    other = reward_table.folded(reward_table.mirrored(train))
+    np.testing.assert_array_equal(other.states[: len(once.states)], once.states)
+    rewards = [reward_table.true_rewards(ds, env.reward) for ds in (train, once)]
+    np.testing.assert_allclose(*rewards)
+
+
 def test_every_family_tries_the_same_number_of_configurations():
     counts = {f: len(reward_table.candidates("cartpole", f)) for f in reward_table.CANDIDATES}
     assert len(set(counts.values())) == 1
@@ -56,7 +67,7 @@ def test_the_whole_table_comes_out(small, tmp_path, monkeypatch, capsys):
     assert "quick mode" in printed
     assert (tmp_path / "cartpole.png").stat().st_size > 10_000
     # chosen on training folds only: the configuration is listed
-    assert all("mirror" in r["config"] for r in result["records"] if r["settings"] == "tuned")
+    assert all("symmetry" in r["config"] for r in result["records"] if r["settings"] == "tuned")
 
 
 def test_the_constant_row_is_the_training_mean(small):
