@@ -106,4 +106,4 @@ class TransitionRelabeler(Relabeler):
         if self.max_rows is not None and self.max_rows < len(begin):
             begin = np.sort(rng.choice(begin, size=self.max_rows, replace=False, shuffle=False))
         episode = np.searchsorted(ds.offsets, begin, side="right") - 1
-        return self.rows(ds, episode, begin, begin + 1), ds.states[begin + 1], episode
+        return self.rows(ds, episode, begin, begin + 1), ds.states.take(begin + 1, axis=0), episode
