@@ -100,7 +100,7 @@ def test_crashing_early_never_pays(Model):
         {"horizon": 3},
         {"random_state": 1},
     ],
-    ids=str,
+    ids=lambda change: "+".join(change),
 )
 def test_every_parameter_changes_the_prediction(change):
     nn = DirectRewardNN(random_state=0).set_params(**FAST)

@@ -80,7 +80,7 @@ def test_grid_search_prefers_what_is_better(ds):
         (OneStepRegressor(), {"estimator__max_steps": [5, 6], "inputs": ["params", "action"]}),
         (DirectRewardNN(), {"estimator__max_steps": [5, 6], "reward": [np.sum], "horizon": [3]}),
     ],
-    ids=str,
+    ids=lambda value: "+".join(value) if isinstance(value, dict) else type(value).__name__,
 )
 def test_grid_search_reaches_the_defaults(ds, model, grid):
     if "reward" in grid:
