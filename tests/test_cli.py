@@ -36,14 +36,20 @@ def test_no_name_shows_help():
     assert RUNNER.invoke(cli.app, ["reproduce"]).exit_code == 2
 
 
-def test_options_go_to_the_benchmark():
-    command = [sys.executable, "-m", "trajlearn.cli", "reproduce", "reward-table", "--help"]
-    code = "import sys; from trajlearn.cli import main; sys.argv = sys.argv[1:]; main()"
-    done = subprocess.run(
-        [sys.executable, "-c", code, *command[2:]], capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0
-    assert "--seeds" in done.stdout
+def test_options_go_to_the_benchmark_and_its_exit_code_comes_back(monkeypatch):
+    ran = []
+
+    def run(command, **settings):
+        ran.append((command, settings))
+        return subprocess.CompletedProcess(command, 3)
+
+    monkeypatch.setattr(cli.subprocess, "run", run)
+    result = RUNNER.invoke(cli.app, ["reproduce", "reward-table", "--seeds", "2", "--help"])
+    assert result.exit_code == 3
+    [(command, settings)] = ran
+    module = "benchmarks.paper.reward_table"
+    assert command == [sys.executable, "-m", module, "--seeds", "2", "--help"]
+    assert (settings["cwd"] / "benchmarks").is_dir()
 
 
 def test_outside_a_checkout_it_says_so(monkeypatch, tmp_path):

@@ -9,6 +9,7 @@ from trajlearn import (
     Cartpole,
     DirectRewardGP,
     DirectRewardNN,
+    LSTMRegressor,
     OneStepRegressor,
     TrajectoryRegressor,
     paper,
@@ -16,6 +17,7 @@ from trajlearn import (
 
 CLASSES = {
     "GP": DirectRewardGP,
+    "LSTM": LSTMRegressor,
     "NN": DirectRewardNN,
     **dict.fromkeys(("D", "P", "DE", "PE"), OneStepRegressor),
     **dict.fromkeys(("T", "TP", "TE", "TPE"), TrajectoryRegressor),
@@ -27,7 +29,7 @@ def test_every_model_has_the_printed_settings(name):
     model = paper.model(name, random_state=0)
     assert type(model) is CLASSES[name]
     clone(model)
-    if name == "GP":
+    if name in ("GP", "LSTM"):
         return
     learner = model.estimator
     assert tuple(learner.hidden_layer_sizes) == (250, 250)
@@ -40,6 +42,16 @@ def test_every_model_has_the_printed_settings(name):
     assert learner.learning_rate == rate
 
 
+def test_the_lstm_has_the_settings_of_the_table():
+    model = paper.model("LSTM")
+    assert (model.n_layers, model.hidden_size) == (2, 250)
+    assert (model.learning_rate, model.schedule) == (1e-3, "constant")
+    assert model.batch_size == 1
+    assert model.max_epochs == 22
+    assert model.target == "state"
+    assert not model.probabilistic
+
+
 def test_t_is_absolute_with_a_scaled_horizon():
     model = paper.model("T")
     assert model.baseline is None
@@ -47,12 +59,14 @@ def test_t_is_absolute_with_a_scaled_horizon():
     assert model.relabeler.starts == model.relabeler.horizons == "uniform"
 
 
-@pytest.mark.parametrize("name", ["D", "TP", "NN", "GP"])
+@pytest.mark.parametrize("name", ["D", "TP", "LSTM", "NN", "GP"])
 def test_models_fit_and_predict(name):
     env = Cartpole(redraw_terminated=True)
     ds = env.collect(4, 20, random_state=0)
     model = paper.model(name, policy=env.policy, reward=env.reward, random_state=0)
-    if name != "GP":
+    if name == "LSTM":
+        model.set_params(max_epochs=1, hidden_size=8)
+    elif name != "GP":
         model.set_params(estimator__max_epochs=1, estimator__hidden_layer_sizes=(8,))
     predicted = np.asarray(model.fit(ds).predict(ds))
     assert predicted.shape == ((4,) if name in ("NN", "GP") else (4, 20, 4))

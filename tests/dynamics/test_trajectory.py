@@ -243,6 +243,18 @@ def test_the_std_of_a_sum_over_a_sampled_path(noise_time, power):
     np.testing.assert_allclose(last, 0.5 * 15**power, rtol=0.06)
 
 
+def test_correlated_noise_keeps_its_variance():
+    model, ds = noisy_constant(0.5, 25)
+    model.gate = None
+    rho = 0.8
+    model.noise_time_ = np.array([-1 / np.log(rho)])
+    samples = model.predict(ds, n_samples=4000, random_state=0).samples
+    np.testing.assert_allclose(samples.std(axis=0), 0.5, rtol=0.06)
+    lag = np.abs(np.subtract.outer(np.arange(25), np.arange(25)))
+    expected = 0.5 * np.sqrt((rho**lag).sum())
+    np.testing.assert_allclose(samples.sum(axis=2).std(axis=0), expected, rtol=0.06)
+
+
 @pytest.mark.parametrize(("dt", "correlation"), [(1.0, 0.9), (0.02, 0.9), (1.0, 0.0)])
 def test_the_noise_time_is_that_of_the_residuals(dt, correlation):
     rng = np.random.default_rng(0)
@@ -369,6 +381,45 @@ def test_an_episode_of_weight_zero_is_left_out(fresh):
     np.testing.assert_allclose(weighted, kept, atol=0.05 * np.ptp(ds.states))
     heavy = np.asarray(model.fit(ds, sample_weight=1 + 50.0 * (np.arange(8) == 0)).predict(test))
     assert np.nanmax(np.abs(heavy - kept)) > np.nanmax(np.abs(weighted - kept))
+
+
+@pytest.mark.parametrize("fresh", [True, False])
+def test_weights_decide_between_episodes_that_disagree(fresh):
+    up = np.arange(9.0)[:, None]
+    ds = TrajectoryDataset.from_arrays([up, -up])
+    model = TrajectoryRegressor(
+        MLPEnsembleRegressor(hidden_layer_sizes=(16,), max_steps=300, batch_size=64),
+        fresh_batches=fresh,
+        random_state=0,
+    )
+    found = model.fit(ds, sample_weight=[3.0, 1.0]).predict(ds[:1]).mean[0, :, 0]
+    np.testing.assert_allclose(found[4:], 0.5 * up[5:, 0], rtol=0.15)
+
+
+def test_the_squared_error_of_the_state_is_minimised_not_that_of_its_gated_change():
+    # the best constant f in s + g(h) f
+    ds = linear(10)
+    rows, targets = SubtrajectoryRelabeler(max_rows=None).fit_resample(ds)
+    model = TrajectoryRegressor(DummyRegressor(), relabeler=EVERY_PAIR, gate=0.3).fit(ds)
+    g = 1 - np.exp(-rows[:, [2]] / (0.3 * model.max_horizon_))
+    change = targets - rows[:, :2]
+    best = (g * change).sum(axis=0) / (g**2).sum(axis=0)
+    np.testing.assert_allclose(model.predict(rows), rows[:, :2] + g * best, atol=1e-9)
+
+
+def test_a_forecast_that_is_not_finite_once_has_diverged_from_there_on():
+    class Broken(Affine):
+        def predict(self, X):
+            return np.where(X[:, [1]] == 3.0, np.inf, 0.0)
+
+    ds = TrajectoryDataset.from_arrays(np.random.default_rng(0).normal(size=(2, 7, 1)))
+    with np.errstate(invalid="ignore"):
+        model = TrajectoryRegressor(Broken(), scaler=FunctionTransformer()).fit(ds)
+    with pytest.warns(DivergenceWarning, match=r"2 of 2 forecasts diverged \(first at step 3\)"):
+        forecast = model.predict(ds)
+    assert forecast.diverged_at.tolist() == [3, 3]
+    assert np.isfinite(forecast.mean[:, :2]).all()
+    assert np.isposinf(forecast.mean[:, 2:]).all()
 
 
 def test_learners_without_weights_refuse_weights():
