@@ -19,6 +19,7 @@ _MODULE_OF = {
     "DirectRewardNN": "dynamics",
     "Forecast": "dynamics",
     "HorizonFeatures": "dynamics",
+    "LSTMRegressor": "dynamics",
     "OneStepRegressor": "dynamics",
     "TrajectoryRegressor": "dynamics",
     "Cartpole": "envs",

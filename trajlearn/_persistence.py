@@ -32,9 +32,11 @@ _CLASSES = {
             "DirectRewardGP",
             "DirectRewardNN",
             "HorizonFeatures",
+            "LSTMRegressor",
             "OneStepRegressor",
             "TrajectoryRegressor",
         ),
+        "trajlearn.dynamics._sequence": ("SequenceLearner",),
         "trajlearn.regressors": ("GPRegressor", "MLPEnsembleRegressor"),
         "trajlearn.trajectories": (
             "EpisodeRelabeler",

@@ -126,7 +126,9 @@ def test_a_roll_out_is_nn_lstm_stepped_by_hand(target, n_layers):
     np.testing.assert_allclose(model.predict([episode], start=start).mean[0], found, atol=1e-5)
 
 
-@pytest.mark.parametrize(("hidden_size", "n_outputs", "n_layers"), [(3, 5, 1), (7, 9, 2), (64, 8, 1)])
+@pytest.mark.parametrize(
+    ("hidden_size", "n_outputs", "n_layers"), [(3, 5, 1), (7, 9, 2), (64, 8, 1)]
+)
 def test_a_sequence_has_the_same_bits_wherever_it_stands(hidden_size, n_outputs, n_layers):
     rng, m = np.random.default_rng(0), 2 * BLOCK + 11
     network = SequenceNetwork(4, n_outputs, hidden_size, n_layers, seed=0)

@@ -2,6 +2,7 @@
 
 from trajlearn.dynamics.direct_reward import DirectRewardGP, DirectRewardNN
 from trajlearn.dynamics.forecast import Forecast
+from trajlearn.dynamics.lstm import LSTMRegressor
 from trajlearn.dynamics.one_step import OneStepRegressor
 from trajlearn.dynamics.scaling import BlockScaler, HorizonFeatures
 from trajlearn.dynamics.trajectory import TrajectoryRegressor
@@ -12,6 +13,7 @@ __all__ = [
     "DirectRewardNN",
     "Forecast",
     "HorizonFeatures",
+    "LSTMRegressor",
     "OneStepRegressor",
     "TrajectoryRegressor",
 ]

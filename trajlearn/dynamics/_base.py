@@ -92,7 +92,8 @@ class TwoDoorRegressor(SaveMixin, RegressorMixin, BaseEstimator):
         own = {key: value for key, value in params.items() if "__" not in key}
         super().set_params(**own)
         nested = {key: value for key, value in params.items() if key not in own}
-        for name in {key.partition("__")[0] for key in nested} & set(_REPLACEABLE):
+        replaceable = set(_REPLACEABLE) & set(self.get_params(deep=False))
+        for name in {key.partition("__")[0] for key in nested} & replaceable:
             if getattr(self, name) is None:
                 setattr(self, name, self._defaults()[name])
         return super().set_params(**nested)
@@ -151,7 +152,8 @@ class TwoDoorRegressor(SaveMixin, RegressorMixin, BaseEstimator):
         chosen = self._defaults()
         for name in chosen:
             # not `or`: some estimators have a length, and an unfitted one has none
-            if getattr(self, name) is not None:
+            # a formulation may have its one learner, and no parameter for it
+            if getattr(self, name, None) is not None:
                 chosen[name] = getattr(self, name)
         self.estimator_ = seeded(chosen["estimator"], self._rng)
         self.relabeler_ = seeded(chosen["relabeler"], self._rng)

@@ -1,14 +1,19 @@
 """What models of one step share: the inputs of a roll-out and where its actions come from."""
 
+from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any
+from numbers import Integral, Real
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trajlearn.dynamics._dynamics import DIVERGENCE_RANGES, DynamicsEstimator
+from trajlearn._sklearn import Interval, StrOptions
+from trajlearn.dynamics._base import TwoDoorRegressor
+from trajlearn.dynamics._dynamics import DIVERGENCE_RANGES, DynamicsEstimator, Prediction
+from trajlearn.dynamics._learner import spread
 from trajlearn.dynamics._query import Query
-from trajlearn.dynamics._rollout import InputRows, Limits
+from trajlearn.dynamics._rollout import InputRows, Limits, Step, roll_out
 from trajlearn.exceptions import MissingFieldError, MixedSamplingError
 from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories._layout import Layout
@@ -27,6 +32,31 @@ class RollingEstimator(DynamicsEstimator):
     policy: Any
     rollout_actions: str
     clip_states: float | None
+    n_particles: int
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        **TwoDoorRegressor._parameter_constraints,
+        "inputs": [StrOptions({"action", "params"}), "array-like"],
+        "target": [StrOptions({"change", "state"})],
+        "policy": [callable, None],
+        "rollout_actions": [StrOptions({"auto", "logged", "policy"})],
+        "clip_states": [Interval(Real, 0, None, closed="neither"), None],
+        "n_particles": [Interval(Integral, 2, None, closed="left")],
+        "error_score": [Interval(Real, None, 0, closed="both")],
+    }
+
+    @abstractmethod
+    def _step(self, query: Query, copies: int, rng: np.random.Generator | None) -> Step:
+        """Step function of a roll-out: of the mean, or of `copies` particles a start with noise.
+
+        Parameters
+        ----------
+        query : Query
+        copies : int
+            Particle i of start j is row ``i * len(query) + j``.
+        rng : Generator or None
+            None asks for the mean, and one copy.
+        """
 
     # -- rows -----------------------------------------------------------------------------
 
@@ -51,6 +81,33 @@ class RollingEstimator(DynamicsEstimator):
             means = means + rows[:, self.layout_["state"]]
         return means, variances * self.target_scale_**2
 
+    # -- fitting --------------------------------------------------------------------------
+
+    def _fit_rows(self, rows: Floats, targets: Floats, weight: Floats | None, groups: Any) -> None:
+        if not hasattr(self.relabeler_, "dt_"):
+            states = np.concatenate([rows[:, self.layout_["state"]], targets])
+            self._learn_ranges(states, tuple(self.layout_.columns["state"]), np.inf)
+            self.relabeler_.dt_ = None
+        self.dt_ = self.relabeler_.dt_
+        largest = np.abs(targets).max(axis=0)
+        self.target_scale_ = spread(self._change(rows, targets), largest, weight)
+        super()._fit_rows(rows, targets, weight, groups)
+
+    def _fit_episodes(
+        self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
+    ) -> None:
+        rows, targets = self.relabeler_.fit_resample(ds)
+        self.layout_ = self.relabeler_.layout_
+        # a model of one step knows no longest horizon
+        self._learn_ranges(ds.states, ds.state_names, np.inf)
+        episode = self.relabeler_.sample_indices_
+        self._fit_rows(
+            rows,
+            targets,
+            None if weight is None else weight[episode],
+            None if groups is None else groups[episode],
+        )
+
     # -- roll-outs ------------------------------------------------------------------------
 
     def _source(self, ds: TrajectoryDataset, actions: str, policy: Any) -> tuple[str, Any]:
@@ -72,13 +129,16 @@ class RollingEstimator(DynamicsEstimator):
                 "Give policy=, or a model with inputs='params'."
             )
         if choice == "logged":
-            block = self.layout_["action"]
-            if len(ds.action_names) != block.stop - block.start:
-                raise ValueError(
-                    f"the episodes have {len(ds.action_names)} actions, the model was fitted on "
-                    f"{block.stop - block.start}."
-                )
+            self._check_action_width(ds)
         return choice, policy
+
+    def _check_action_width(self, ds: TrajectoryDataset) -> None:
+        block = self.layout_["action"]
+        if len(ds.action_names) != block.stop - block.start:
+            raise ValueError(
+                f"the episodes have {len(ds.action_names)} actions, the model was fitted on "
+                f"{block.stop - block.start}."
+            )
 
     def _reads_logged_future(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
         return self._source(ds, actions, policy)[0] == "logged" or "references" in self.layout_
@@ -93,6 +153,41 @@ class RollingEstimator(DynamicsEstimator):
                 f"{dt:g}. "
                 'Resample them (ds.resample), or fit with "dt" among inputs=.'
             )
+
+    def _forecast(
+        self,
+        query: Query,
+        *,
+        actions: str,
+        policy: Any,
+        return_std: bool,
+        n_samples: int | None,
+        rng: np.random.Generator,
+    ) -> Prediction:
+        source, policy = self._source(query.ds, actions, policy)
+        self._check_time_step(query.ds)
+
+        def rolled_out(copies: int, rng: np.random.Generator | None) -> Floats:
+            return roll_out(
+                np.tile(query.initial_states, (copies, 1)),
+                query.n_steps,
+                self._input_rows(query, source, policy, copies=copies),
+                self._step(query, copies, rng),
+                self._limits(),
+            )
+
+        prediction = Prediction(rolled_out(1, None), actions=source)
+        n_paths = max(n_samples or 0, self.n_particles if return_std else 0)
+        if not n_paths:
+            return prediction
+        paths = rolled_out(n_paths, rng).reshape(n_paths, *prediction.mean.shape)
+        if return_std:
+            with np.errstate(invalid="ignore"):
+                std = paths.std(axis=0)
+            prediction.std = np.where(np.isinf(paths).any(axis=0), np.inf, std)
+        if n_samples:
+            prediction.samples = paths[:n_samples].copy()
+        return prediction
 
     def _limits(self) -> Limits:
         low, high = self.state_range_

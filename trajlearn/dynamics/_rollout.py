@@ -12,6 +12,8 @@ from trajlearn.regressors._prediction import mean_of_members
 Floats = NDArray[np.float64]
 # rows of inputs for the states at a step: (states (m, d_s), step) -> (m, n_features)
 InputRows = Callable[[Floats, int], Floats]
+# states after a step: (rows (m, n_features), step) -> (m, d_s)
+Step = Callable[[Floats, int], Floats]
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ def roll_out(
     initial_states: Floats,
     n_steps: int,
     inputs: InputRows,
-    step: Callable[[Floats, int], Floats],
+    step: Step,
     limits: Limits,
 ) -> Floats:
     """Apply a step function again and again.
@@ -70,14 +72,14 @@ def roll_out(
     return path
 
 
-def expected_step(moments: Moments) -> Callable[[Floats, int], Floats]:
+def expected_step(moments: Moments) -> Step:
     """Mean over members at every step."""
     return lambda rows, k: mean_of_members(moments(rows)[0])
 
 
 def sampled_step(
     moments: Moments, member: NDArray[np.intp] | None, rng: np.random.Generator
-) -> Callable[[Floats, int], Floats]:
+) -> Step:
     """One member a particle, with its noise: fixed (TSinf), or drawn anew at every step (TS1).
 
     Parameters

@@ -1,26 +1,20 @@
 """One-step models: the next state from state and action (or theta), rolled out."""
 
 from collections.abc import Sequence
-from numbers import Integral, Real
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from trajlearn._sklearn import Interval, StrOptions
-from trajlearn.dynamics._base import TwoDoorRegressor
-from trajlearn.dynamics._dynamics import Prediction
-from trajlearn.dynamics._learner import mixture, spread
+from trajlearn._sklearn import StrOptions
+from trajlearn.dynamics._learner import Moments, mixture
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics._rolling import RollingEstimator
-from trajlearn.dynamics._rollout import expected_step, roll_out, sampled_step
+from trajlearn.dynamics._rollout import Step, expected_step, sampled_step
 from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
-from trajlearn.trajectories import TrajectoryDataset, TransitionRelabeler
+from trajlearn.trajectories import TransitionRelabeler
 
 __all__ = ["OneStepRegressor"]
-
-Floats = NDArray[np.float64]
 
 
 class OneStepRegressor(RollingEstimator):
@@ -99,15 +93,8 @@ class OneStepRegressor(RollingEstimator):
     """
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        **TwoDoorRegressor._parameter_constraints,
-        "inputs": [StrOptions({"action", "params"}), "array-like"],
-        "target": [StrOptions({"change", "state"})],
-        "policy": [callable, None],
-        "rollout_actions": [StrOptions({"auto", "logged", "policy"})],
-        "clip_states": [Interval(Real, 0, None, closed="neither"), None],
+        **RollingEstimator._parameter_constraints,
         "propagation": [StrOptions({"tsinf", "ts1", "expectation"})],
-        "n_particles": [Interval(Integral, 2, None, closed="left")],
-        "error_score": [Interval(Real, None, 0, closed="both")],
     }
 
     def __init__(
@@ -146,86 +133,24 @@ class OneStepRegressor(RollingEstimator):
             "scaler": BlockScaler(),
         }
 
-    # -- fitting --------------------------------------------------------------------------
-
-    def _fit_rows(self, rows: Floats, targets: Floats, weight: Floats | None, groups: Any) -> None:
-        if not hasattr(self.relabeler_, "dt_"):
-            states = np.concatenate([rows[:, self.layout_["state"]], targets])
-            self._learn_ranges(states, tuple(self.layout_.columns["state"]), np.inf)
-            self.relabeler_.dt_ = None
-        self.dt_ = self.relabeler_.dt_
-        largest = np.abs(targets).max(axis=0)
-        self.target_scale_ = spread(self._change(rows, targets), largest, weight)
-        super()._fit_rows(rows, targets, weight, groups)
-
-    def _fit_episodes(
-        self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
-    ) -> None:
-        rows, targets = self.relabeler_.fit_resample(ds)
-        self.layout_ = self.relabeler_.layout_
-        # a model of one step knows no longest horizon
-        self._learn_ranges(ds.states, ds.state_names, np.inf)
-        episode = self.relabeler_.sample_indices_
-        self._fit_rows(
-            rows,
-            targets,
-            None if weight is None else weight[episode],
-            None if groups is None else groups[episode],
-        )
-
     # -- forecasting ----------------------------------------------------------------------
 
-    def _forecast(
-        self,
-        query: Query,
-        *,
-        actions: str,
-        policy: Any,
-        return_std: bool,
-        n_samples: int | None,
-        rng: np.random.Generator,
-    ) -> Prediction:
-        source, policy = self._source(query.ds, actions, policy)
-        self._check_time_step(query.ds)
+    def _step(self, query: Query, copies: int, rng: np.random.Generator | None) -> Step:
         moments = self._moments()
-        initial, n_steps = query.initial_states, query.n_steps
-        mean = roll_out(
-            initial,
-            n_steps,
-            self._input_rows(query, source, policy, copies=1),
-            expected_step(moments),
-            self._limits(),
-        )
-        prediction = Prediction(mean, actions=source)
-        n_paths = max(n_samples or 0, self.n_particles if return_std else 0)
-        if not n_paths:
-            return prediction
-        self._check_uncertainty(moments, query)
+        if rng is None:
+            return expected_step(moments)
+        self._check_uncertainty(moments)
         member = None
         n_members = getattr(self.estimator_, "n_members", 1)
         if self.propagation == "tsinf":
-            member = np.repeat(rng.permutation(np.arange(n_paths) % n_members), len(query))
-        paths = roll_out(
-            np.tile(initial, (n_paths, 1)),
-            n_steps,
-            self._input_rows(query, source, policy, copies=n_paths),
-            sampled_step(moments, member, rng),
-            self._limits(),
-        ).reshape(n_paths, *mean.shape)
-        if return_std:
-            with np.errstate(invalid="ignore"):
-                std = paths.std(axis=0)
-            prediction.std = np.where(np.isinf(paths).any(axis=0), np.inf, std)
-        if n_samples:
-            prediction.samples = paths[:n_samples].copy()
-        return prediction
+            member = np.repeat(rng.permutation(np.arange(copies) % n_members), len(query))
+        return sampled_step(moments, member, rng)
 
-    def _check_uncertainty(self, moments: Any, query: Query) -> None:
+    def _check_uncertainty(self, moments: Moments) -> None:
         if self.propagation == "expectation":
             raise ValueError(
                 'propagation="expectation" carries no uncertainty: choose "tsinf" or "ts1" for '
                 "return_std= or n_samples=."
             )
-        width = self.layout_.width
-        means, variances = moments(np.zeros((1, width)))
+        means, variances = moments(np.zeros((1, self.layout_.width)))
         mixture(means, variances, self.estimator_)

@@ -20,7 +20,7 @@ def oscillators(
     n : int
     seed : int
     irregular : bool, default=False
-        Time steps between 0.1 and 0.3 instead of 0.2.
+        Time steps between 0.06 and 0.34 instead of 0.2.
     equal : bool, default=False
         12 steps each instead of 6 to 12.
     """
@@ -39,7 +39,7 @@ def oscillators(
 
 def _episode(rng: np.random.Generator, steps: int, irregular: bool) -> dict[str, Any]:
     gains, states = rng.uniform(0.2, 1.0, size=2), np.empty((steps + 1, 2))
-    dt = rng.uniform(0.5, 1.5, size=steps) * DT if irregular else np.full(steps, DT)
+    dt = rng.uniform(0.3, 1.7, size=steps) * DT if irregular else np.full(steps, DT)
     states[0], actions = rng.uniform(-1, 1, size=2), np.empty((steps, 1))
     for t in range(steps):
         position, velocity = states[t]
