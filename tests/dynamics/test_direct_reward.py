@@ -57,6 +57,20 @@ def test_the_mean_reward_is_learned_and_the_score_is_r2(model, least):
     assert np.mean(np.abs(mean - means(test)) < 3 * std) > 0.85
 
 
+def test_mean_and_std_are_in_units_of_the_reward():
+    train, test = decays(20), decays(5, seed=1)
+    once, tenfold = (
+        DirectRewardGP(
+            GPRegressor(n_restarts=0), reward=lambda s, k=k: -k * s[..., 0] ** 2, random_state=0
+        )
+        .fit(train)
+        .predict(test, return_std=True)
+        for k in (1.0, 10.0)
+    )
+    np.testing.assert_allclose(tenfold[0], 10 * once[0], rtol=1e-3)
+    np.testing.assert_allclose(tenfold[1], 10 * once[1], rtol=1e-3)
+
+
 def test_a_reward_function_of_the_states_is_as_good_as_the_log():
     train, test = decays(), decays(10, seed=1)
     by_log, by_function = (

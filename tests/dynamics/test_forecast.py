@@ -124,7 +124,10 @@ def test_at_picks_horizons_and_moves_the_counts_along():
     assert part.lengths.tolist() == [3, 2, 3]
     assert part.diverged_at.tolist() == [0, 0, 3]
     assert forecast.at([1, 2]).diverged_at.tolist() == [0, 0, 0]
-    assert forecast.at(4).mean.shape == (3, 1, 2)
+    fourth = forecast.at(4)
+    assert fourth.mean.shape == (3, 1, 2)
+    assert fourth.lengths.tolist() == [1, 0, 1]
+    assert fourth.diverged_at.tolist() == [0, 0, 1]
     with pytest.raises(ValueError, match=r"\[9\] were not predicted"):
         forecast.at([1, 9])
     with pytest.raises(ValueError, match="increase strictly"):
@@ -168,6 +171,12 @@ def test_squared_errors_are_in_training_ranges():
     assert np.isnan(squared[1, 2:]).all()
     assert np.isposinf(squared[2, 2:]).all()
     np.testing.assert_allclose(squared[2, :2], expected[2, :2])
+
+
+def test_a_diverged_step_is_infinitely_wrong_whatever_stands_there():
+    forecast = make(diverged=(0, 2, 0))
+    forecast.mean[1, 1] = np.nan
+    assert np.isposinf(forecast.squared_errors(logged(forecast))[1, 1]).all()
 
 
 def test_a_constant_state_has_range_one():

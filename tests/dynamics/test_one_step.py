@@ -198,6 +198,10 @@ def test_references_and_context_are_inputs():
     model = ols(inputs="params").fit(ds)
     assert list(model.layout_) == ["state", "params", "context", "references"]
     np.testing.assert_allclose(model.predict(ds), states[:, 1:], atol=1e-10)
+    with pytest.raises(MissingFieldError, match="no context 'task'"):
+        model.predict_trajectory(
+            states[:, 0], params=np.zeros(1), references=references[:, :4], horizons=[3]
+        )
     wide = TrajectoryDataset.from_arrays(
         states,
         references=np.concatenate([references] * 2, axis=2),

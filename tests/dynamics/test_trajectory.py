@@ -80,6 +80,12 @@ def test_known_references_of_the_future_are_inputs():
     np.testing.assert_allclose(model.predict(ds), truth(ds), atol=1e-9)
     later = model.predict(ds, start=3)
     np.testing.assert_allclose(later, truth(ds)[:, 3:], atol=1e-9)
+    planned = model.predict_trajectory(
+        ds.states[::9], references=references[:, [0, 2, 7]], horizons=[2.0, 7.0]
+    )
+    np.testing.assert_allclose(planned.mean, truth(ds)[:, [1, 6]], atol=1e-9)
+    with pytest.raises(MissingFieldError, match="references"):
+        model.predict_trajectory(ds.states[:1], horizons=[2.0])
     # what is known ends with the log
     assert (model.predict(ds, start=5, horizon=20).lengths == 3).all()
 
@@ -357,7 +363,7 @@ def test_rows_of_a_draw_decide_where_batches_are_not_fresh():
 def test_early_stopping_needs_fixed_rows_and_keeps_groups_together():
     ds = linear(10)
     settings = {"estimator__early_stopping": True, "relabeler__max_rows": 200}
-    with pytest.raises(ValueError, match="early_stopping"):
+    with pytest.raises(ValueError, match="fresh_batches=False"):
         small(**settings).fit(ds)
     model = small(fresh_batches=False, **settings)
     by_episode = np.asarray(model.fit(ds).predict(ds))
@@ -381,6 +387,17 @@ def test_an_episode_of_weight_zero_is_left_out(fresh):
     np.testing.assert_allclose(weighted, kept, atol=0.05 * np.ptp(ds.states))
     heavy = np.asarray(model.fit(ds, sample_weight=1 + 50.0 * (np.arange(8) == 0)).predict(test))
     assert np.nanmax(np.abs(heavy - kept)) > np.nanmax(np.abs(weighted - kept))
+
+
+@pytest.mark.parametrize("fresh", [True, False])
+def test_scalers_and_scale_are_those_of_the_weighted_rows(fresh):
+    ds = TrajectoryDataset.from_arrays([np.linspace(0, 1, 30)[:, None], np.full((30, 1), 9.0)])
+    model = small(fresh_batches=fresh).fit(ds, sample_weight=[1.0, 3.0])
+    state = next(part for columns, part in model.scaler_.parts_ if columns.tolist() == [0])
+    np.testing.assert_allclose(state.mean_, 0.75 * 9.0 + 0.25 * 0.25, rtol=0.05)
+    alone = small(fresh_batches=fresh).fit(ds[:1])
+    # three quarters of the changes are zero
+    assert 0.4 < model.target_scale_[0] / alone.target_scale_[0] < 0.9
 
 
 @pytest.mark.parametrize("fresh", [True, False])

@@ -435,3 +435,18 @@ def test_wrong_parameters_are_refused(wrong):
     (name,) = wrong
     with pytest.raises(ValueError, match=name):
         SubtrajectoryRelabeler(**wrong).fit(everything())
+
+
+def test_rewards_of_another_set_are_held_to_the_horizon_of_the_training_episodes():
+    def crashes(*lengths):
+        return TrajectoryDataset.from_arrays(
+            [np.ones((length + 1, 1)) for length in lengths],
+            rewards=[np.ones(length) for length in lengths],
+            terminated=[length < 10 for length in lengths],
+        )
+
+    relabeler = EpisodeRelabeler(terminal_reward=0.0)
+    relabeler.fit_resample(crashes(10, 10, 5))
+    assert relabeler.horizon_ == 10
+    # 4 of 10 steps earn 1; over its own 4 steps it would be 1
+    np.testing.assert_allclose(relabeler.targets(crashes(4)), [0.4])

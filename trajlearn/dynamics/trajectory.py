@@ -183,6 +183,13 @@ class TrajectoryRegressor(DynamicsEstimator):
 
     def _fit_stream(self, ds: TrajectoryDataset, weight: Floats | None) -> None:
         """Fresh sub-trajectories for every batch."""
+        learner = self.estimator_
+        fixed = ("early_stopping", "bootstrap", "max_epochs")
+        if asked := [name for name in fixed if getattr(learner, name, None)]:
+            raise ValueError(
+                f"{', '.join(asked)} of the learner needs rows that stay the same from batch to "
+                "batch: set fresh_batches=False."
+            )
         draw_pairs = self.relabeler_.sampler(ds)
         rows, targets, episode = draw_pairs(_SCALER_ROWS, self._rng)
         by_row = None if weight is None else weight[episode]

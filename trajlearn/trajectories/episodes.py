@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from numbers import Integral, Real
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
 from trajlearn._sklearn import Interval
 from trajlearn.trajectories._relabeler import Floats, Ints, Relabeler
+from trajlearn.trajectories.coerce import as_dataset
 from trajlearn.trajectories.dataset import TrajectoryDataset
 from trajlearn.trajectories.rewards import episode_rewards
 
@@ -34,6 +35,8 @@ class EpisodeRelabeler(Relabeler):
     Attributes
     ----------
     layout_ : mapping from block to slice
+    horizon_ : int
+        Steps that the reward is averaged over.
     sample_indices_ : ndarray of shape (n,)
 
     Examples
@@ -69,6 +72,23 @@ class EpisodeRelabeler(Relabeler):
         self.inputs = inputs
         self.random_state = random_state
 
+    def fit(self, X: Any, y: None = None) -> Self:
+        """Learn the layout, the categories of the context, and the common horizon.
+
+        Parameters
+        ----------
+        X : TrajectoryDataset or list of Trajectory
+        y : None
+            Ignored.
+
+        Returns
+        -------
+        self
+        """
+        super().fit(X)
+        self.horizon_ = int(as_dataset(X).lengths.max()) if self.horizon is None else self.horizon
+        return self
+
     def _resample(
         self, ds: TrajectoryDataset, rng: np.random.Generator
     ) -> tuple[Floats, Floats, Ints]:
@@ -77,7 +97,7 @@ class EpisodeRelabeler(Relabeler):
         return self.rows(ds, episode, first, first), self.targets(ds), episode
 
     def targets(self, ds: TrajectoryDataset) -> Floats:
-        """Mean reward per step of each episode.
+        """Mean reward per step of each episode over the horizon learned in `fit`.
 
         Parameters
         ----------
@@ -88,5 +108,5 @@ class EpisodeRelabeler(Relabeler):
         ndarray of shape (n,)
         """
         return episode_rewards(
-            ds, self.reward, horizon=self.horizon, terminal_reward=self.terminal_reward
+            ds, self.reward, horizon=self.horizon_, terminal_reward=self.terminal_reward
         )
