@@ -203,7 +203,7 @@ class DynamicsEstimator(TwoDoorRegressor):
             raise ValueError("y must be omitted with episodes.")
         ds = as_dataset(X)
         squared = self.forecast(ds).squared_errors(ds)
-        asked = np.isfinite(squared) | np.isinf(squared)
+        asked = ~np.isnan(squared)
         per_episode = -np.where(asked, squared, 0).sum(axis=(1, 2)) / asked.sum(axis=(1, 2))
         per_episode = np.maximum(per_episode, self.error_score)
         return float(np.average(per_episode, weights=sample_weight))

@@ -190,21 +190,11 @@ class LSTMRegressor(RollingEstimator):
         self.verbose = verbose
 
     def _defaults(self) -> dict[str, Any]:
+        # its seed comes from this estimator's own, as every learner's does
+        own = (name for name in SequenceLearner().get_params() if name != "random_state")
+        learner = {name: getattr(self, name) for name in own}
         return {
-            "estimator": SequenceLearner(
-                hidden_size=self.hidden_size,
-                n_layers=self.n_layers,
-                probabilistic=self.probabilistic,
-                learning_rate=self.learning_rate,
-                schedule=self.schedule,
-                batch_size=self.batch_size,
-                max_steps=self.max_steps,
-                max_epochs=self.max_epochs,
-                weight_decay=self.weight_decay,
-                window=self.window,
-                device=self.device,
-                verbose=self.verbose,
-            ),
+            "estimator": SequenceLearner(**learner),
             "relabeler": TransitionRelabeler(inputs=self.inputs),
             "scaler": BlockScaler(),
         }
