@@ -8,6 +8,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 import trajlearn
 
 _PACKAGES = ("numpy", "scipy", "scikit-learn", "torch", "gpytorch", "control", "mujoco")
@@ -43,6 +45,14 @@ def write_json(path: Path, payload: Any) -> None:
 def read_json(path: Path) -> Any:
     """Read what `write_json` wrote; "inf", "-inf" and "nan" become numbers again."""
     return _numbers(json.loads(path.read_text(encoding="utf-8")))
+
+
+def write_csv(path: Path, table: pd.DataFrame) -> None:
+    """Write a table atomically, without its index; numbers keep five significant digits."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    table.to_csv(part, index=False, float_format="%.5g", lineterminator="\n")
+    os.replace(part, path)
 
 
 def _plain(value: Any) -> Any:

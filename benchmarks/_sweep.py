@@ -21,6 +21,8 @@ def run_cells(
     *,
     n_jobs: int = 1,
     description: str = "cells",
+    scheduler: str | None = None,
+    local_workers: int | None = None,
 ) -> list[Any]:
     """Results of ``function(**cell)`` for every cell, in order.
 

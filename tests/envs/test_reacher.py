@@ -294,12 +294,17 @@ def test_the_default_goal_is_just_within_reach_of_the_targets():
     assert Reacher().reward(far).max() < -0.1  # seldom met by chance
 
 
-def test_the_tip_of_averaged_states_is_the_average_tip_of_one_uncertain_joint():
-    angles = np.tile([0.3, -0.4, 0.5, 0.0, 0.2], (50, 1))
-    angles[:, 3] = np.random.default_rng(0).normal(size=50)
+def test_a_shrunken_prediction_leaves_the_links_as_long_as_they_are():
+    angles = np.random.default_rng(0).uniform(-2, 2, size=(20, 5))
     states = states_of(angles)
-    average = Reacher().fingertip(states.mean(axis=0))
-    np.testing.assert_allclose(average, Reacher().fingertip(states).mean(axis=0), atol=1e-12)
+    shrunken = np.concatenate([0.7 * states[:, :10], states[:, 10:]], axis=1)
+    np.testing.assert_allclose(Reacher().fingertip(shrunken), Reacher().fingertip(states))
+
+
+def test_a_pair_of_zeros_is_no_angle_but_a_number():
+    nowhere = states_of(np.zeros(5))
+    nowhere[[0, 5]] = 0.0
+    np.testing.assert_allclose(Reacher().fingertip(nowhere)[:2], [0.0, 0.25])
 
 
 # Draws

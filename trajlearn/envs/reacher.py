@@ -184,8 +184,9 @@ class Reacher(Environment):
         Parameters
         ----------
         states : array-like of shape (..., 15)
-            States, with any leading shape. Cosines and sines are taken as they are, also those
-            of a prediction, whose squares do not add up to 1.
+            States, with any leading shape. Each pair (cos, sin) is divided by its length, so that
+            a prediction whose squares do not add up to 1 leaves the links as long as they are; a
+            pair of zeros stands for no angle and folds the rest of the arm into its joint.
 
         Returns
         -------
@@ -199,6 +200,8 @@ class Reacher(Environment):
         """
         s = self._checked_states(states)
         cos, sin = (np.moveaxis(s[..., at : at + N_JOINTS], -1, 0) for at in (0, N_JOINTS))
+        length = np.hypot(cos, sin)
+        cos, sin = (part / np.where(length > 0, length, 1.0) for part in (cos, sin))
         # from the tip inwards: a link along -y is turned by a joint, the next link is added
         x, y, z = np.zeros_like(cos[0]), -LINK * cos[4], -LINK * sin[4]
         x, y = cos[3] * x - sin[3] * y, sin[3] * x + cos[3] * y - LINK

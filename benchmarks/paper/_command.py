@@ -1,0 +1,192 @@
+"""What the commands of this folder share: options, resumable cells, tables, figures, redrawing.
+
+A benchmark is four functions: `run` gives tables, `report` and `draw` turn tables into text and
+figures, `settings` says what a reader of the numbers must know. Tables are CSV files beside a
+JSON file with the provenance, so that text and figures can be made again without running anything.
+"""
+
+import argparse
+import shutil
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from benchmarks._results import provenance, read_json, write_csv, write_json
+from benchmarks._sweep import Cell, run_cells
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RESULTS = Path(__file__).parent / "results"
+
+Tables = dict[str, pd.DataFrame]
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run of a benchmark: how much of it, by how many workers, and where to.
+
+    Attributes
+    ----------
+    name : str
+        Of the benchmark and its folder.
+    mode : {"full", "quick"}
+    seeds : list of int
+    root : Path
+        Folder of the results of all benchmarks.
+    n_jobs : int
+        Processes of this machine.
+    workers : dict
+        Further arguments of `run_cells`: where else to compute.
+    """
+
+    name: str
+    mode: str
+    seeds: list[int]
+    root: Path
+    n_jobs: int
+    workers: dict[str, Any]
+
+    @property
+    def folder(self) -> Path:
+        """Where the results of this benchmark go."""
+        return self.root / self.name
+
+    def cells(
+        self, cells: Iterable[Cell], function: Callable[..., Any], *, shared: str | None = None
+    ) -> list[Any]:
+        """Results of ``function(**cell)``, finished cells from disk.
+
+        Benchmarks that need the same fits name the same `shared` folder and do them once.
+        """
+        folder = self.root / (shared or self.name) / "cells" / self.mode
+        return run_cells(
+            cells, function, folder, n_jobs=self.n_jobs, description=self.name, **self.workers
+        )
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """What a module of this folder defines.
+
+    Attributes
+    ----------
+    name : str
+        As typed after ``trajlearn reproduce``.
+    about : str
+        The module's docstring, for ``--help``.
+    run : callable
+        ``run(run: Run) -> Tables``.
+    report : callable
+        ``report(tables) -> str``: Markdown, printed and stored.
+    draw : callable
+        ``draw(tables) -> dict`` from the stem of a file to a figure.
+    settings : callable
+        ``settings(mode) -> dict`` for the provenance.
+    minutes : int
+        That a full run takes on two cores, about.
+    seeds : int
+        Of a full run.
+    """
+
+    name: str
+    about: str
+    run: Callable[[Run], Tables]
+    report: Callable[[Tables], str]
+    draw: Callable[[Tables], "dict[str, Figure]"]
+    settings: Callable[[str], dict[str, Any]]
+    minutes: int
+    seeds: int = 3
+
+    def main(self, arguments: list[str] | None = None) -> None:
+        """Run from the command line."""
+        options = self._parser().parse_args(arguments)
+        mode = "quick" if options.quick else "full"
+        # a quick run never overwrites the results that the documentation quotes
+        root = (options.out or (RESULTS if mode == "full" else Path("results"))).resolve()
+        folder = root / self.name
+        if options.redraw:
+            self._show(folder, read_tables(folder, self.name))
+            return
+        if options.fresh:
+            shutil.rmtree(folder / "cells" / mode, ignore_errors=True)
+        seeds = list(range(1 if options.quick else options.seeds))
+        workers = {"scheduler": options.scheduler, "local_workers": options.local_workers}
+        tables = self.run(Run(self.name, mode, seeds, root, options.n_jobs, workers))
+        for stem, table in tables.items():
+            write_csv(folder / f"{stem}.csv", table)
+        facts = provenance(mode, seeds, **self.settings(mode))
+        write_json(folder / f"{self.name}.json", facts | {"tables": list(tables)})
+        self._show(folder, read_tables(folder, self.name))
+        if mode == "quick":
+            print(
+                "This was the quick mode: one seed, short training. The full run, about "
+                f"{self.minutes} minutes on two cores: .venv/bin/trajlearn reproduce {self.name}"
+            )
+
+    def _show(self, folder: Path, tables: Tables) -> None:
+        """Text and figures of the tables as they are on disk: redrawing gives the same."""
+        import matplotlib as mpl
+
+        mpl.use("Agg")
+        # the same picture gives the same bytes
+        mpl.rcParams["svg.hashsalt"] = self.name
+        text = self.report(tables)
+        (folder / f"{self.name}.md").write_text(text.rstrip() + "\n", encoding="utf-8")
+        for stem, figure in self.draw(tables).items():
+            figure.savefig(folder / f"{stem}.png", dpi=130, bbox_inches="tight")
+            nothing = {"Date": None}
+            figure.savefig(folder / f"{stem}.svg", bbox_inches="tight", metadata=nothing)
+            mpl.pyplot.close(figure)
+        print(f"\n{text.rstrip()}\n\nWritten to {folder}.")
+
+    def _parser(self) -> argparse.ArgumentParser:
+        parser = argparse.ArgumentParser(
+            prog=f"trajlearn reproduce {self.name}",
+            description=self.about,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            epilog="Every finished cell is stored at once: a run that was stopped goes on where "
+            "it was.",
+        )
+        add = parser.add_argument
+        add("--quick", action="store_true", help="one seed, short training: minutes")
+        add("--seeds", type=_positive, default=self.seeds, help="(default: %(default)s)")
+        add("--n-jobs", type=int, default=2, help="processes (default: %(default)s)")
+        add("--local-workers", type=_positive, help="this many processes of a Dask cluster here")
+        add("--scheduler", metavar="ADDRESS", help="a Dask cluster, such as tcp://node:8786")
+        add("--out", type=Path, help="folder of the results of all benchmarks")
+        add("--fresh", action="store_true", help="forget the cells of earlier runs")
+        add("--redraw", action="store_true", help="text and figures from the stored results")
+        return parser
+
+
+def read_tables(folder: Path, name: str) -> Tables:
+    """Tables that a benchmark has stored in a folder."""
+    path = folder / f"{name}.json"
+    if not path.exists():
+        raise SystemExit(f"There are no results in {folder}: run without --redraw first.")
+    return {stem: pd.read_csv(folder / f"{stem}.csv") for stem in read_json(path)["tables"]}
+
+
+def markdown(table: pd.DataFrame) -> str:
+    """A table as Markdown; numbers keep two significant digits, a missing one is a blank."""
+
+    def entry(value: Any) -> str:
+        if isinstance(value, float):
+            return "" if value != value else f"{value:.2g}"
+        return "" if value is None else str(value)
+
+    head = [str(name) for name in table.columns]
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    lines += ["| " + " | ".join(map(entry, row)) + " |" for row in table.itertuples(index=False)]
+    return "\n".join(lines)
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError("must be at least 1")
+    return value
