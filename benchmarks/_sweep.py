@@ -2,16 +2,28 @@
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable
+import traceback
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from joblib import Parallel, delayed, parallel_config
+from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from benchmarks._results import read_json, write_json
+from benchmarks._results import _plain, read_json, write_json
+from trajlearn.trajectories._extras import import_extra
 
 Cell = dict[str, Any]
+
+
+class Outcome(NamedTuple):
+    """What became of a cell: its result, or the traceback of its failure."""
+
+    number: int
+    result: Any = None
+    failure: str | None = None
 
 
 def run_cells(
@@ -26,35 +38,122 @@ def run_cells(
 ) -> list[Any]:
     """Results of ``function(**cell)`` for every cell, in order.
 
+    This process alone writes, each result as it arrives: workers need not share its disk. A
+    process that is killed loses the cells in flight, and no other.
+
     Parameters
     ----------
     cells : iterable of dict
-        Arguments that JSON can hold; they name the cell's file.
+        Arguments that JSON can hold; they alone name the cell's file.
     function : callable
-        At module level, so that a worker process can import it.
+        At module level, so that a worker process can import it. Functions that are called with
+        the same arguments need folders of their own.
     folder : Path
         One file a finished cell; delete it to start afresh.
     n_jobs : int
         Processes.
     description : str
         Of the progress bar.
+    scheduler : str, optional
+        Address of a Dask scheduler, such as ``"tcp://node:8786"``, whose workers compute.
+    local_workers : int, optional
+        Processes of a Dask cluster of this machine that compute, and end with the sweep.
+
+    Raises
+    ------
+    ValueError
+        If `scheduler` and `local_workers` are both given.
+    ImportError
+        If Dask is asked for and missing.
+    RuntimeError
+        After all cells, if some of them failed: the others are stored.
     """
+    if scheduler is not None and local_workers is not None:
+        raise ValueError(
+            f"scheduler={scheduler!r} and local_workers={local_workers} both say where to "
+            "compute: give one of them."
+        )
     cells = list(cells)
     paths = [folder / f"{_name(cell)}.json" for cell in cells]
-    todo = [(cell, path) for cell, path in zip(cells, paths, strict=True) if not path.exists()]
-    bar = tqdm(total=len(cells), initial=len(cells) - len(todo), desc=description, unit="cell")
-    with bar, parallel_config("loky", inner_max_num_threads=1):
-        work = (delayed(_run)(function, cell, path) for cell, path in todo)
-        for _ in Parallel(n_jobs=n_jobs, return_as="generator_unordered")(work):
+    wanted = dict(zip(paths, cells, strict=True))
+    todo = [(path, cell) for path, cell in wanted.items() if not _finished(path)]
+    failures: dict[int, str] = {}
+    bar = tqdm(total=len(wanted), initial=len(wanted) - len(todo), desc=description, unit="cell")
+    with bar, _outcomes(todo, function, n_jobs, scheduler, local_workers) as outcomes:
+        for number, result, failure in outcomes:
+            path, cell = todo[number]
+            if failure is None:
+                write_json(path, {"cell": cell, "result": result})
+            else:
+                failures[number] = failure
+                bar.set_postfix(failed=len(failures))
             bar.update()
+    if failures:
+        first = min(failures)
+        raise RuntimeError(
+            f"{len(failures)} of {len(wanted)} cells failed; the others are stored, and starting "
+            f"again repeats only the failed ones. The first: {todo[first][1]}\n\n{failures[first]}"
+        )
     return [read_json(path)["result"] for path in paths]
 
 
-def _run(function: Callable[..., Any], cell: Cell, path: Path) -> None:
+def _run(number: int, function: Callable[..., Any], cell: Cell) -> Outcome:
+    """Compute one cell, in a worker, on one thread."""
     import torch
 
     torch.set_num_threads(1)
-    write_json(path, {"cell": cell, "result": function(**cell)})
+    with threadpool_limits(1), parallel_config("sequential"):
+        try:
+            result = _plain(function(**cell))
+            json.dumps(result)  # what no file can hold fails here, as the cell's own failure
+        except Exception:
+            return Outcome(number, failure=traceback.format_exc())
+    return Outcome(number, result)
+
+
+def _lost(arguments: tuple[Any, ...], error: BaseException) -> Outcome:
+    """Outcome of a `_run` that did not come to its end."""
+    return Outcome(arguments[0], failure="".join(traceback.format_exception(error)))
+
+
+@contextmanager
+def _outcomes(
+    todo: list[tuple[Path, Cell]],
+    function: Callable[..., Any],
+    n_jobs: int,
+    scheduler: str | None,
+    local_workers: int | None,
+) -> Iterator[Iterable[Outcome]]:
+    """Outcomes of cells as they arrive, from processes of joblib or a Dask cluster."""
+    if not todo:
+        yield ()
+        return
+    local = scheduler is None and local_workers is None
+    # what is handed out early, the processes of a sweep that was killed would still compute; a
+    # cluster forgets it, and can share it with workers that come later
+    parallel_as = {"batch_size": 1, "pre_dispatch": "n_jobs" if local else "all"}
+    with ExitStack() as stack:
+        if local:
+            backend = parallel_config("loky", n_jobs=n_jobs, inner_max_num_threads=1)
+        else:
+            import_extra("distributed", "dask", by="a sweep on a Dask cluster")
+            from benchmarks._cluster import cluster_backend
+
+            cluster = cluster_backend(scheduler, local_workers, [_run, function], _lost)
+            backend = parallel_config(stack.enter_context(cluster))
+        stack.enter_context(backend)
+        work = (delayed(_run)(i, function, cell) for i, (_, cell) in enumerate(todo))
+        outcomes = Parallel(return_as="generator_unordered", **parallel_as)(work)
+        yield stack.enter_context(closing(outcomes))
+
+
+def _finished(path: Path) -> bool:
+    """Whether a file holds a result; a damaged one (a disk that was full, say) does not."""
+    try:
+        stored = read_json(path)
+    except (FileNotFoundError, ValueError):
+        return False
+    return isinstance(stored, dict) and "result" in stored
 
 
 def _name(cell: Cell) -> str:

@@ -18,6 +18,7 @@ from sklearn.preprocessing import (
 
 from tests.dynamics.systems import SMALL, gain_policy, linear
 from trajlearn import (
+    PID,
     BlockScaler,
     DirectRewardGP,
     DirectRewardNN,
@@ -26,6 +27,7 @@ from trajlearn import (
     MLPEnsembleRegressor,
     OneStepRegressor,
     SubtrajectoryRelabeler,
+    TrajectoryDataset,
     TrajectoryRegressor,
     TransitionRelabeler,
     load,
@@ -36,6 +38,10 @@ from trajlearn.exceptions import UnknownFileError
 
 def squared(states):
     return -(states[..., 0] ** 2)
+
+
+def squares(states, params):
+    return states**2
 
 
 def t(**settings):
@@ -93,6 +99,20 @@ def test_every_estimator_comes_back_with_the_same_bits(model, ds, path):
     again.save(path)
 
 
+def test_a_pid_comes_back_with_its_settings(path):
+    rng = np.random.default_rng(0)
+    joints = TrajectoryDataset.from_arrays(
+        rng.normal(size=(2, 6, 3)),
+        actions=rng.normal(size=(2, 5, 1)),
+        params=rng.normal(size=(2, 3)),
+    )
+    model = d(policy=PID("cos", p_scale=3.0)).fit(joints)
+    model.save(path)
+    again = load(path)
+    assert again.policy == PID("cos", p_scale=3.0)
+    np.testing.assert_array_equal(np.asarray(again.predict(joints)), model.predict(joints))
+
+
 def test_estimators_fitted_on_rows(path):
     rows = np.random.default_rng(0).normal(size=(20, 4))
     pandas = pytest.importorskip("pandas")
@@ -147,6 +167,17 @@ def test_functions_are_stored_by_name_and_given_again(ds, path):
     again = load(path, callables={"gain_policy": gain_policy})
     assert again.predict(ds).actions == "policy"
     np.testing.assert_array_equal(again.predict(ds).mean, model.predict(ds).mean)
+
+
+def test_features_are_stored_by_name_and_given_again(ds, path):
+    model = t(scaler__features=squares).fit(ds)
+    model.save(path)
+    with pytest.raises(ValueError, match=r"callables=\{'squares': \.\.\.\}"):
+        load(path)
+    again = load(path, callables={"squares": squares})
+    assert again.scaler.features is squares
+    np.testing.assert_array_equal(again.predict(ds).mean, model.predict(ds).mean)
+    assert not np.array_equal(again.predict(ds).mean, t().fit(ds).predict(ds).mean)
 
 
 def test_two_functions_of_one_name_are_told_apart(ds, path):

@@ -44,7 +44,7 @@ _CLASSES = {
             "TransitionRelabeler",
         ),
         "trajlearn.trajectories._layout": ("Layout",),
-        "trajlearn.policies": ("LinearFeedback",),
+        "trajlearn.policies": ("LinearFeedback", "PID"),
         "sklearn.preprocessing": (
             "FunctionTransformer",
             "MaxAbsScaler",
@@ -98,7 +98,7 @@ def load(path: str | Path, *, callables: Mapping[str, Callable[..., Any]] | None
     ----------
     path : str or Path
     callables : mapping from name to function, optional
-        Policies and reward functions the estimator was built with, by their names.
+        Policies, reward functions and features the estimator was built with, by their names.
 
     Returns
     -------

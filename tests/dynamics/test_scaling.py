@@ -124,6 +124,151 @@ def test_bad_slots_are_refused():
         HorizonFeatures(n_scales=-1).fit(rows())
 
 
+# -- features of state and params -----------------------------------------------------------
+
+
+def error(states, params):
+    """Two columns of unequal size, as a controller might compute them."""
+    gain, target = params.T
+    return np.column_stack([target - states[:, 1], 100 * gain * np.arctan2(*states.T)])
+
+
+@pytest.mark.parametrize("horizon", [None, HorizonFeatures(n_scales=3)], ids=["affine", "not"])
+def test_features_follow_all_blocks_with_mean_0_and_variance_1(horizon):
+    X, new = rows(), rows(9, seed=1)
+    plain = BlockScaler(horizon=horizon).fit(X, layout=LAYOUT)
+    scaler = BlockScaler(horizon=horizon, features=error).fit(X, layout=LAYOUT)
+    width = plain.transform(X).shape[1]
+    assert scaler.block_columns_["features"].tolist() == [width, width + 1]
+    np.testing.assert_array_equal(scaler.transform(new)[:, :width], plain.transform(new))
+    of_unscaled = StandardScaler().fit(error(X[:, :2], X[:, 4:6]))
+    np.testing.assert_allclose(
+        scaler.transform(new)[:, width:],
+        of_unscaled.transform(error(new[:, :2], new[:, 4:6])),
+        rtol=1e-12,
+        atol=1e-12,
+    )
+    assert (scaler.affine_ is None) == (horizon is not None)
+    assert scaler.n_features_in_ == X.shape[1]
+
+
+def test_weights_count_for_features_too():
+    X, weight = rows(), 1 + np.arange(50) % 4
+    repeated = BlockScaler(features=error).fit(np.repeat(X, weight, axis=0), layout=LAYOUT)
+    weighted = BlockScaler(features=error).fit(X, layout=LAYOUT, sample_weight=weight.astype(float))
+    np.testing.assert_allclose(weighted.transform(X), repeated.transform(X), atol=1e-10)
+
+
+def test_a_constant_feature_is_divided_by_its_magnitude():
+    def values(states, params):
+        return np.where(states[:, :1] > 1e3, -4.4, -4.0)
+
+    X = rows()
+    scaler = BlockScaler(features=values).fit(X, layout=LAYOUT)
+    np.testing.assert_allclose(scaler.transform(X)[:, -1], -1.0)
+    np.testing.assert_allclose(scaler.transform(X + 1e4)[:, -1], -1.1)
+
+
+@pytest.mark.parametrize("layout", [None, {"horizon": slice(0, 1), "state": slice(1, 8)}])
+def test_without_params_features_get_none_of_them(layout):
+    shapes = []
+
+    def square(states, params):
+        shapes.append((states.shape, params.shape))
+        return states[:, -1:] ** 2
+
+    X = rows()
+    scaler = BlockScaler(features=square).fit(X, layout=layout)
+    assert shapes == [((50, 8 if layout is None else 7), (50, 0))]
+    expected = StandardScaler().fit_transform(X[:, -1:] ** 2)
+    np.testing.assert_allclose(scaler.transform(X)[:, -1:], expected, atol=1e-12)
+
+
+def test_features_may_overwrite_their_arguments():
+    def careless(states, params):
+        states -= params
+        params[:] = 0
+        return states
+
+    X = rows()
+    before = X.copy()
+    careful = BlockScaler(features=lambda states, params: states - params)
+    scaler = BlockScaler(features=careless).fit(X, layout=LAYOUT)
+    np.testing.assert_array_equal(
+        scaler.scaled(X), careful.fit(before, layout=LAYOUT).scaled(before)
+    )
+    np.testing.assert_array_equal(X, before)
+
+
+@pytest.mark.parametrize("horizon", [None, HorizonFeatures(n_scales=3)], ids=["affine", "not"])
+def test_a_row_with_features_has_the_same_bits_alone_and_in_a_batch(horizon):
+    def waves(states, params):
+        a, b = params.T[:, :, None]
+        return np.hstack([np.sin(a * states), np.arctan2(b, states), np.exp(-a), np.sqrt(b)])
+
+    X = rows(300)
+    scaler = BlockScaler(horizon=horizon, features=waves).fit(X, layout=LAYOUT)
+    batch = scaler.transform(X)
+    for n in (1, 2, 3, 7, 8, 33, 128):
+        parts = [scaler.transform(X[at : at + n]) for at in range(0, len(X), n)]
+        np.testing.assert_array_equal(np.concatenate(parts), batch)
+
+
+@pytest.mark.parametrize(
+    ("returned", "message"),
+    [
+        (lambda s: s[:, 0], r"shape \(50,\) for states of shape \(50, 2\).*expected \(50, k\)"),
+        (lambda s: s[:1], r"shape \(1, 2\)"),
+        (lambda s: s[:, :0], r"shape \(50, 0\).*expected \(50, k\).*at least one column"),
+        (lambda s: s.T, r"shape \(2, 50\)"),
+        (lambda s: s[:, None], r"shape \(50, 1, 2\)"),
+        (lambda s: None, r"shape \(\)"),
+        (lambda s: s / (s[:, :1] != s[7, 0]), "NaN or infinite.*clipping"),
+        (lambda s: np.where(s == s[7, 0], np.nan, s), "NaN or infinite.*clipping"),
+    ],
+    ids=["1-D", "one row", "no column", "transposed", "3-D", "nothing", "infinite", "NaN"],
+)
+@pytest.mark.filterwarnings("ignore:divide by zero")
+def test_bad_features_are_refused_by_name(returned, message):
+    def controller_error(states, params):
+        return returned(states)
+
+    with pytest.raises(ValueError, match=f"features=controller_error returned .*{message}"):
+        BlockScaler(features=controller_error).fit(rows(), layout=LAYOUT)
+
+
+def test_bad_features_are_refused_at_prediction_too():
+    def logarithm(states, params):
+        with np.errstate(invalid="ignore"):
+            return np.log(states[:, :1])
+
+    def by_number(states, params):
+        return states[:, [0] * (1 if len(states) == 50 else 2)]
+
+    X = np.abs(rows()) + 1
+    far = X.copy()
+    far[3, 0] = -5.0
+    scaler = BlockScaler(features=logarithm).fit(X, layout=LAYOUT)
+    with pytest.raises(ValueError, match=r"features=logarithm.* first for states \[-5\. "):
+        scaler.scaled(far)
+    scaler = BlockScaler(features=by_number).fit(X, layout=LAYOUT)
+    with pytest.raises(ValueError, match=r"shape \(9, 2\).*expected \(9, 1\).*always as many"):
+        scaler.scaled(X[:9])
+
+
+def test_features_need_states():
+    scaler = BlockScaler(features=error)
+    with pytest.raises(
+        ValueError, match=r"features=error .*no block 'state'.*\['params'\].*layout"
+    ):
+        scaler.fit(rows(), layout={"params": slice(0, 8)})
+    with pytest.raises(ValueError, match="'features' parameter"):
+        BlockScaler(features="error").fit(rows())
+
+
+# -- features of the horizon ----------------------------------------------------------------
+
+
 @given(
     longest=st.integers(2, 5000),
     dt=st.sampled_from([0.02, 1.0, 250.0]),

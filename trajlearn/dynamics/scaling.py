@@ -1,5 +1,6 @@
 """Scaling rows block by block, and features of the horizon."""
 
+from collections.abc import Callable
 from numbers import Integral
 from typing import Any, ClassVar, Self
 
@@ -122,11 +123,19 @@ class BlockScaler(TransformerMixin, BaseEstimator):
     ----------
     state, action, horizon, params : transformer, "passthrough" or None, default=None
         What each block is scaled by.
+    features : callable or None, default=None
+        ``features(states (n, d_s), params (n, p)) -> (n, k)``: what is known to matter, such as
+        the control error, computed from the unscaled rows. The k columns follow all blocks,
+        scaled to mean 0 and variance 1. Row i may depend on row i only; p = 0 where rows hold no
+        params. It is called for predicted states, too, and has to be finite there.
 
     Attributes
     ----------
     parts_ : list of (columns, transformer)
-        Columns of the input and the fitted transformer (None: division by `magnitude_`).
+        Columns of the input, followed by the features, and the fitted transformer (None:
+        division by `magnitude_`).
+    block_columns_ : dict from block to ndarray
+        Columns of the output; those of the features under ``"features"``.
 
     See Also
     --------
@@ -141,20 +150,35 @@ class BlockScaler(TransformerMixin, BaseEstimator):
     >>> BlockScaler().fit(rows, layout=layout).transform(rows)
     array([[-1., -1., -1.],
            [ 1.,  1.,  1.]])
+
+    The parameter is the set-point of the second state, and the error drives the system:
+
+    >>> def error(states, params):
+    ...     return params - states[:, 1:]
+    >>> BlockScaler(features=error).fit(rows, layout=layout).transform(rows)
+    array([[-1., -1., -1., -1.],
+           [ 1.,  1.,  1.,  1.]])
     """
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         slot: [HasMethods(["fit", "transform"]), StrOptions({"passthrough"}), None]
         for slot in ("state", "action", "horizon", "params")
-    }
+    } | {"features": [callable, None]}
 
     def __init__(
-        self, *, state: Any = None, action: Any = None, horizon: Any = None, params: Any = None
+        self,
+        *,
+        state: Any = None,
+        action: Any = None,
+        horizon: Any = None,
+        params: Any = None,
+        features: Callable[[Floats, Floats], Any] | None = None,
     ) -> None:
         self.state = state
         self.action = action
         self.horizon = horizon
         self.params = params
+        self.features = features
 
     def fit(
         self,
@@ -178,18 +202,30 @@ class BlockScaler(TransformerMixin, BaseEstimator):
         Returns
         -------
         self
+
+        Raises
+        ------
+        ValueError
+            If `features` is given and the layout has no states, or it returns something else
+            than a finite (n, k).
         """
         self._validate_params()
         rows: Floats = validate_data(self, X, dtype=np.float64)
         if layout is None:
             layout = Layout.of_rows(rows.shape[1], rows.shape[1], ("params",))
+        blocks = dict(layout.items())
+        if self.features is not None:
+            self.arguments_ = self._argument_columns(blocks)
+            computed = self._computed(rows)
+            blocks["features"] = slice(rows.shape[1], rows.shape[1] + computed.shape[1])
+            rows = np.concatenate([rows, computed], axis=1)
         largest = np.abs(rows).max(axis=0)
         constant = np.ptp(rows, axis=0) <= _CONSTANT * largest
         self.magnitude_ = np.where(largest > 0, largest, 1.0)
         self.parts_: list[tuple[NDArray[np.intp], Any]] = []
         self.block_columns_: dict[str, NDArray[np.intp]] = {}
         width = 0
-        for block, where in layout.items():
+        for block, where in blocks.items():
             columns = np.arange(rows.shape[1])[where]
             varying = columns[~constant[columns]]
             begin = width
@@ -209,8 +245,53 @@ class BlockScaler(TransformerMixin, BaseEstimator):
         self._set_affine()
         return self
 
+    def _argument_columns(
+        self, blocks: dict[str, slice]
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Columns of the input that hold the arguments of `features`."""
+        if "state" not in blocks:
+            raise ValueError(
+                f"{self._features_name} computes from states, but the rows have no block 'state' "
+                f"(they have {list(blocks)}). Add it to inputs= or the layout, or leave features= "
+                "out."
+            )
+        columns = np.arange(self.n_features_in_)
+        return columns[blocks["state"]], columns[blocks.get("params", slice(0))]
+
+    @property
+    def _features_name(self) -> str:
+        return f"features={getattr(self.features, '__name__', type(self.features).__name__)}"
+
+    def _computed(self, rows: Floats, width: int | None = None) -> Floats:
+        """Features of unscaled rows (n, k); k = `width` if that is known."""
+        assert self.features is not None  # callers have checked
+        # take() copies, always in C order: the callable may overwrite its arguments, and finds
+        # the same memory layout for one row as for many
+        states, params = (rows.take(columns, axis=1) for columns in self.arguments_)
+        values = np.asarray(self.features(states, params), dtype=np.float64)
+        k = values.shape[1] if values.ndim == 2 else 0
+        if not k or values.shape != (len(rows), width or k):
+            hint = " (inputs= decides whether rows hold params)" if not params.size else ""
+            raise ValueError(
+                f"{self._features_name} returned shape {values.shape} for states of shape "
+                f"{states.shape} and params of shape {params.shape}{hint}; expected "
+                f"({len(rows)}, {width or 'k'}), a row for each row of states and at least one "
+                "column, always as many."
+            )
+        finite = np.isfinite(values).all(axis=1)
+        if not finite.all():
+            states, params = (rows[~finite][0, columns] for columns in self.arguments_)
+            raise ValueError(
+                f"{self._features_name} returned NaN or infinite values, first for states {states} "
+                f"and params {params}. Make it finite for all states and params, for instance by "
+                "clipping them: a forecast asks for it at states that no episode has visited."
+            )
+        return values
+
     def _transformer(self, block: str) -> Any:
         slot = _SLOT_OF.get(block, block)
+        if slot == "features":
+            return StandardScaler()
         chosen = "passthrough" if slot == "context" else getattr(self, slot)
         if chosen == "passthrough":
             return FunctionTransformer()
@@ -247,7 +328,10 @@ class BlockScaler(TransformerMixin, BaseEstimator):
         return self.scaled(validate_data(self, X, dtype=np.float64, reset=False))
 
     def scaled(self, X: Floats) -> Floats:
-        """`transform` without validation, for hot loops."""
+        """`transform` without validation of X, for hot loops."""
+        if self.features is not None:
+            width = len(self.magnitude_) - self.n_features_in_
+            X = np.concatenate([X, self._computed(X, width)], axis=1)
         if self.affine_ is not None:
             columns, scale, shift = self.affine_
             return X[:, columns] * scale + shift

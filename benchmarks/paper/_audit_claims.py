@@ -1,0 +1,291 @@
+"""What the paper claims, and the stored results that speak for or against it.
+
+Statements are the paper's, in our words; every number comes from a table.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pandas as pd
+
+from benchmarks.paper._claims import Claim, Comparison, compare, compare_seeds, number
+from benchmarks.paper._command import Tables
+from benchmarks.paper._tasks import TASKS
+
+Sources = dict[str, Tables]
+
+#: Where a roll-out takes its actions from, as a condition reads.
+ACTIONS = {"logged": "logged actions", "policy": "recomputed actions"}
+# settings as a condition reads, and how they mark the name of a model
+_SETTINGS = {"paper's settings": "", "tuned (our defaults)": " (ours)"}
+
+
+def claims(sources: Sources) -> list[Claim]:
+    """Every claim that later pages of the audit judge, in the paper's order."""
+    return [
+        long_horizons(sources),
+        short_horizons(sources),
+        beyond_training(sources),
+        error_growth(sources),
+        recomputed_actions(sources),
+        ensembles(sources),
+        trajectory_ensembles(sources),
+        sample_efficiency(sources),
+        reward_prediction(sources),
+        data_types(sources),
+        planning(sources),
+        continuous_time(sources),
+    ]
+
+
+def _against_one_step(sources: Sources, window: str) -> Iterator[Comparison]:
+    """Error of every rolled-out model over that of T, task by task, in a window of horizons."""
+    episodes = sources["horizon-error"]["episodes"]
+    for task in TASKS:
+        some = episodes[episodes["task"] == task]
+        for how, mark in _SETTINGS.items():
+            models = ["D", "PE", "LSTM"] if not mark else ["D", "LSTM"]
+            for actions, by in ACTIONS.items():
+                for model in models:
+                    yield compare(
+                        some,
+                        {"model": model + mark, "actions": actions},
+                        {"model": "T" + mark},
+                        window,
+                        condition=f"{task}, {how}, {by}",
+                        what=f"{model} / T",
+                    )
+        yield compare(
+            some,
+            {"model": "C (ours)"},
+            {"model": "T (ours)"},
+            window,
+            condition=f"{task}, tuned (our defaults), no actions",
+            what="C / T",
+        )
+
+
+def long_horizons(sources: Sources) -> Claim:
+    return Claim(
+        "Trajectory models are more accurate far ahead",
+        "Beyond 50 steps T has a fifth to a tenth of the error of one-step models and LSTMs, "
+        "which are given the recorded actions.",
+        list(_against_one_step(sources, "long")),
+        figure="horizon-error/horizon-error-ours.png",
+    )
+
+
+def short_horizons(sources: Sources) -> Claim:
+    return Claim(
+        "Trajectory models are less accurate at short horizons",
+        "Below 25 steps T is worse than one-step models.",
+        [_inverted(one) for one in _against_one_step(sources, "short")],
+    )
+
+
+def beyond_training(sources: Sources) -> Claim:
+    return Claim(
+        "Trajectory models keep their lead beyond the training length",
+        "On test episodes longer than any training episode T remains more accurate than one-step "
+        "models.",
+        list(_against_one_step(sources, "beyond")),
+    )
+
+
+def error_growth(sources: Sources) -> Claim:
+    """Growth is the error beyond the training length over that within it."""
+    episodes = sources["horizon-error"]["episodes"]
+    middle = episodes.groupby(["task", "model", "actions", "seed"])[["long", "beyond"]].median()
+    growth = (middle["beyond"] / middle["long"]).where(np.isfinite(middle["beyond"]), np.inf)
+    comparisons = []
+    for task in TASKS:
+        for how, mark in _SETTINGS.items():
+            for actions, by in ACTIONS.items():
+                for model in ["D", "PE"] if not mark else ["D"]:
+                    comparisons.append(
+                        compare_seeds(
+                            growth.loc[task, model + mark, actions].to_numpy(),
+                            growth.loc[task, "T" + mark, "none"].to_numpy(),
+                            condition=f"{task}, {how}, {by}",
+                            what=f"growth of {model} / growth of T",
+                        )
+                    )
+    return Claim(
+        "The error of one-step models keeps growing, that of trajectory models stays",
+        "The error of a one-step model goes on growing with the number of steps; T's remains "
+        "stable.",
+        comparisons,
+        notes=[
+            "Growth: median error beyond the training length over that from step 51 to the "
+            "training length."
+        ],
+    )
+
+
+def recomputed_actions(sources: Sources) -> Claim:
+    episodes = sources["action-source"]["episodes"]
+    comparisons = [
+        compare(
+            episodes[episodes["task"] == task],
+            {"model": model, "actions": "policy"},
+            {"model": model, "actions": "logged"},
+            "long",
+            condition=f"{task}, {how}",
+            what=f"{model.removesuffix(' (ours)')}, recomputed / logged",
+        )
+        for task in TASKS
+        for model, how in (("PE", "paper's settings"), ("D (ours)", "tuned (our defaults)"))
+    ]
+    return Claim(
+        "Recomputing the actions makes one-step models worse",
+        "Errors compound when the action is computed from the predicted state instead of being "
+        "given; one-step models are therefore compared with recorded actions.",
+        comparisons,
+        figure="action-source/action-source.png",
+    )
+
+
+def ensembles(sources: Sources) -> Claim:
+    episodes = sources["all-models"]["episodes"]
+    return Claim(
+        "One-step models: PE is better than P, P than DE, DE than D",
+        "Probabilistic models are more accurate than deterministic ones, ensembles than single "
+        "models.",
+        [
+            compare(
+                episodes[episodes["task"] == task],
+                {"model": worse, "actions": actions},
+                {"model": better, "actions": actions},
+                "long",
+                condition=f"{task}, {by}",
+                what=f"{worse} / {better}",
+            )
+            for task in TASKS
+            for actions, by in ACTIONS.items()
+            for better, worse in (("PE", "P"), ("P", "DE"), ("DE", "D"))
+        ],
+        figure="all-models/all-models.png",
+    )
+
+
+def trajectory_ensembles(sources: Sources) -> Claim:
+    episodes = sources["all-models"]["episodes"]
+    pairs = (("TE", "T", False), ("TPE", "TP", False), ("TP", "T", True))
+    return Claim(
+        "Trajectory models: ensembles help, probabilistic training does not",
+        "TE is better than T and TPE than TP; TP is about as accurate as T.",
+        [
+            compare(
+                episodes[episodes["task"] == task],
+                {"model": a if same else b},
+                {"model": b if same else a},
+                "long",
+                condition=task,
+                what=f"{a} / {b}" if same else f"{b} / {a}",
+                same=same,
+            )
+            for task in TASKS
+            for a, b, same in pairs
+        ],
+    )
+
+
+def sample_efficiency(sources: Sources) -> Claim:
+    errors, data = (sources["sample-efficiency"][name] for name in ("errors", "data"))
+    comparisons = []
+    for how, mark in _SETTINGS.items():
+        models = ["D", "PE"] if not mark else ["D (ours)", "D (ours), clipped"]
+        for actions, by in ACTIONS.items():
+            for model in models:
+                for where, cells in _grid_parts(errors).items():
+                    comparisons.append(
+                        compare_seeds(
+                            *_grid_medians(cells, (model, actions), ("T" + mark, "none")),
+                            condition=f"{how}, {by}, {where}",
+                            what=f"{model.replace(' (ours)', '')} / T",
+                        )
+                    )
+    return Claim(
+        "Trajectory models need fewer and shorter episodes",
+        "On a grid of few and short reacher episodes T predicts 100 steps substantially better "
+        "than one-step models, because its labelled data grow with the square of the length.",
+        comparisons,
+        notes=[_growth_of_data(errors, data)],
+        figure="sample-efficiency/sample-efficiency.png",
+    )
+
+
+def _grid_parts(errors: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """The whole grid, and episodes as long as the forecast."""
+    longest = errors["length"].max()
+    return {"all of the grid": errors, f"L = {longest}": errors[errors["length"] == longest]}
+
+
+def _grid_medians(
+    cells: pd.DataFrame, above: tuple[str, str], below: tuple[str, str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Geometric middle over the grid of the ratio of two models, seed by seed, over 1."""
+    index = ["seed", "length", "n_episodes"]
+    a, b = (
+        cells[(cells["model"] == model) & (cells["actions"] == actions)].set_index(index)["error"]
+        for model, actions in (above, below)
+    )
+    middle = (a / b).groupby(level="seed").median().to_numpy()
+    return middle, np.ones_like(middle)
+
+
+def _growth_of_data(errors: pd.DataFrame, data: pd.DataFrame) -> str:
+    """What twice the length does to the labelled data and to the errors."""
+    longest, most = errors["length"].max(), errors["n_episodes"].max()
+    half = longest // 2
+    sizes = data[data["n_episodes"] == most].set_index("length")
+    rows = {
+        name: sizes[name].loc[longest] / sizes[name].loc[half] for name in ("pairs", "transitions")
+    }
+    at = errors[errors["n_episodes"] == most].set_index(["model", "actions", "length"])["error"]
+
+    def falls(model: str, actions: str) -> str:
+        return number(
+            float(at.loc[model, actions, half].median() / at.loc[model, actions, longest].median())
+        )
+
+    return (
+        f"From L = {half} to L = {longest} with {most} episodes the pairs (s_t, s_t+h) grow "
+        f"{number(rows['pairs'])} times and the transitions {number(rows['transitions'])} times; "
+        f"T's error falls by a factor {falls('T', 'none')} (ours: {falls('T (ours)', 'none')}), "
+        f"that of D with recomputed actions by {falls('D', 'policy')} (ours: "
+        f"{falls('D (ours)', 'policy')}). The pairs are not independent: they come from the same "
+        "episodes."
+    )
+
+
+def planning(sources: Sources) -> Claim:
+    seconds = sources["audit"]["planning"]
+    by_way = seconds.set_index(["way", "candidates", "seed"])["seconds"]
+    return Claim(
+        "Planning is cheaper with one evaluation than with a roll-out",
+        "Evaluating all horizons at once spares the sequential steps of a roll-out and can "
+        "raise the rate of planning dramatically.",
+        [
+            compare_seeds(
+                by_way.loc["one-step", n].to_numpy(),
+                by_way.loc[way, n].to_numpy(),
+                condition=f"{n} candidates, {way.partition(', ')[2] or 'every horizon'}",
+                what="seconds of one-step / seconds of T",
+            )
+            for n in seconds["candidates"].unique()
+            for way in ("T", "T, every 10th horizon")
+        ],
+        notes=[
+            "Bare networks of the same size in plain torch on one CPU thread, 200 steps; this "
+            "library's overhead is not in these numbers (see benchmarks/speed)."
+        ],
+    )
+
+
+def _inverted(one: Comparison) -> Comparison:
+    """The reciprocal ratio, for a claim that T is worse."""
+    a, _, b = one.what.partition(" / ")
+    with np.errstate(divide="ignore"):
+        estimate, high, low, *seeds = 1 / np.array([one.estimate, one.low, one.high, *one.seeds])
+    return Comparison(one.condition, f"{b} / {a}", estimate, low, high, tuple(seeds), one.same)

@@ -1,0 +1,151 @@
+"""The paper's claims as comparisons that can fail, and the verdict that follows from them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from benchmarks.paper._intervals import by_seed, ratio, ratio_of_each_seed
+
+#: How far apart two errors may be that are called the same.
+SAME = 1.5
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One measured ratio; above 1 it speaks for the claim (or, if `same`, near 1).
+
+    Attributes
+    ----------
+    condition : str
+        Where it was measured: task, settings, actions.
+    what : str
+        What is divided by what.
+    estimate, low, high : float
+        Ratio, and the ends of its interval; NaN where only seeds are known.
+    seeds : tuple of float
+        The ratio of each seed.
+    same : bool
+        Whether the claim is that there is no difference worth mentioning.
+    """
+
+    condition: str
+    what: str
+    estimate: float
+    low: float
+    high: float
+    seeds: tuple[float, ...]
+    same: bool = False
+
+    @property
+    def verdict(self) -> str:
+        """Whether it speaks "for" the claim, "against" it, or is "open".
+
+        The interval tells of the test episodes, the seeds of training: both must agree.
+        """
+        ends = [value for value in (self.low, self.high, *self.seeds) if not np.isnan(value)]
+        if not ends:
+            return "open"
+        least, most = min(ends), max(ends)
+        if self.same:
+            if least > 1 / SAME and most < SAME:
+                return "for"
+            return "against" if least > SAME or most < 1 / SAME else "open"
+        if least > 1:
+            return "for"
+        return "against" if most < 1 else "open"
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What the paper says, and what was measured."""
+
+    title: str
+    says: str
+    comparisons: Sequence[Comparison]
+    notes: Sequence[str] = field(default=())
+    figure: str | None = None
+
+    @property
+    def verdict(self) -> str:
+        """ "holds", "holds only if" or "fails"; "not measured" without comparisons."""
+        each = {comparison.verdict for comparison in self.comparisons}
+        if not each:
+            return "not measured"
+        if each == {"for"}:
+            return "holds"
+        return "holds only if" if "for" in each else "fails"
+
+    def conditions(self, verdict: str) -> list[str]:
+        """Conditions under which all comparisons have a verdict, in order."""
+        met: dict[str, bool] = {}
+        for one in self.comparisons:
+            met[one.condition] = met.get(one.condition, True) and one.verdict == verdict
+        return [condition for condition, all_of_it in met.items() if all_of_it]
+
+    def effect(self) -> str:
+        """Least and greatest ratio over all comparisons."""
+        ratios = [one.estimate for one in self.comparisons]
+        if not ratios:
+            return ""
+        return f"{number(min(ratios))} to {number(max(ratios))}"
+
+
+def number(value: float) -> str:
+    """Two significant digits, as the tables print them."""
+    if np.isinf(value):
+        return "∞" if value > 0 else "-∞"
+    return "?" if np.isnan(value) else f"{value:.2g}"
+
+
+def compare(
+    episodes: pd.DataFrame,
+    above: dict[str, Any],
+    below: dict[str, Any],
+    column: str,
+    *,
+    condition: str,
+    what: str,
+    same: bool = False,
+) -> Comparison:
+    """Ratio of median errors of two selections of a table of test episodes.
+
+    Parameters
+    ----------
+    episodes : DataFrame
+        A line a seed and test episode.
+    above, below : dict
+        Values of columns that select the lines of numerator and denominator.
+    column : str
+        The error.
+    condition, what, same
+        Of the `Comparison`.
+    """
+    a, b = (by_seed(_selected(episodes, chosen), column) for chosen in (above, below))
+    return Comparison(
+        condition, what, *ratio(a, b), seeds=tuple(ratio_of_each_seed(a, b)), same=same
+    )
+
+
+def compare_seeds(
+    a: ArrayLike, b: ArrayLike, *, condition: str, what: str, same: bool = False
+) -> Comparison:
+    """Ratio of two numbers that are known once a seed: median, and no interval but the seeds."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = np.asarray(a, dtype=np.float64) / np.asarray(b, dtype=np.float64)
+    if not len(ratios):
+        raise ValueError(f"there is no seed to compare for {what!r} ({condition}).")
+    middle = float(np.median(ratios))
+    return Comparison(condition, what, middle, np.nan, np.nan, tuple(ratios.tolist()), same)
+
+
+def _selected(table: pd.DataFrame, chosen: dict[str, Any]) -> pd.DataFrame:
+    """Lines with these values; an error says what is missing."""
+    for column, value in chosen.items():
+        table = table[table[column] == value]
+    if table.empty:
+        raise ValueError(f"the results have no lines with {chosen}: run the benchmark again.")
+    return table
