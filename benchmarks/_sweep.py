@@ -13,7 +13,6 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from benchmarks._results import _plain, read_json, write_json
-from trajlearn.trajectories._extras import import_extra
 
 Cell = dict[str, Any]
 
@@ -35,6 +34,7 @@ def run_cells(
     description: str = "cells",
     scheduler: str | None = None,
     local_workers: int | None = None,
+    fresh: bool = False,
 ) -> list[Any]:
     """Results of ``function(**cell)`` for every cell, in order.
 
@@ -46,10 +46,9 @@ def run_cells(
     cells : iterable of dict
         Arguments that JSON can hold; they alone name the cell's file.
     function : callable
-        At module level, so that a worker process can import it. Functions that are called with
-        the same arguments need folders of their own.
+        At module level, so that a worker process can import it.
     folder : Path
-        One file a finished cell; delete it to start afresh.
+        One file a finished cell.
     n_jobs : int
         Processes.
     description : str
@@ -58,6 +57,8 @@ def run_cells(
         Address of a Dask scheduler, such as ``"tcp://node:8786"``, whose workers compute.
     local_workers : int, optional
         Processes of a Dask cluster of this machine that compute, and end with the sweep.
+    fresh : bool
+        Whether to forget what earlier sweeps stored of these cells.
 
     Raises
     ------
@@ -76,14 +77,18 @@ def run_cells(
     cells = list(cells)
     paths = [folder / f"{_name(cell)}.json" for cell in cells]
     wanted = dict(zip(paths, cells, strict=True))
-    todo = [(path, cell) for path, cell in wanted.items() if not _finished(path)]
+    if fresh:
+        for path in paths:
+            path.unlink(missing_ok=True)
+    name = function.__qualname__
+    todo = [(path, cell) for path, cell in wanted.items() if not _finished(path, name)]
     failures: dict[int, str] = {}
     bar = tqdm(total=len(wanted), initial=len(wanted) - len(todo), desc=description, unit="cell")
     with bar, _outcomes(todo, function, n_jobs, scheduler, local_workers) as outcomes:
         for number, result, failure in outcomes:
             path, cell = todo[number]
             if failure is None:
-                write_json(path, {"cell": cell, "result": result})
+                write_json(path, {"function": name, "cell": cell, "result": result})
             else:
                 failures[number] = failure
                 bar.set_postfix(failed=len(failures))
@@ -136,6 +141,9 @@ def _outcomes(
         if local:
             backend = parallel_config("loky", n_jobs=n_jobs, inner_max_num_threads=1)
         else:
+            # only here: every worker imports this module
+            from trajlearn.trajectories._extras import import_extra
+
             import_extra("distributed", "dask", by="a sweep on a Dask cluster")
             from benchmarks._cluster import cluster_backend
 
@@ -147,13 +155,18 @@ def _outcomes(
         yield stack.enter_context(closing(outcomes))
 
 
-def _finished(path: Path) -> bool:
-    """Whether a file holds a result; a damaged one (a disk that was full, say) does not."""
+def _finished(path: Path, function: str) -> bool:
+    """Whether a file holds a result of this function.
+
+    A damaged file (a disk that was full, say) does not.
+    """
     try:
         stored = read_json(path)
     except (FileNotFoundError, ValueError):
         return False
-    return isinstance(stored, dict) and "result" in stored
+    if not isinstance(stored, dict) or "result" not in stored:
+        return False
+    return stored.get("function", function) == function
 
 
 def _name(cell: Cell) -> str:

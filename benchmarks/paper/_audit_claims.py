@@ -259,6 +259,43 @@ def _growth_of_data(errors: pd.DataFrame, data: pd.DataFrame) -> str:
     )
 
 
+def data_types(sources: Sources) -> Claim:
+    pairs = sources["data-types"]["pairs"]
+    comparisons = []
+    for kinds in (("stable", "periodic", "unstable"), ("survivors",)):
+        for trained in kinds:
+            for how, mark in _SETTINGS.items():
+                for actions, by in ACTIONS.items():
+                    for tested in ("stable", "periodic", kinds[-1]):
+                        some = pairs[(pairs["trained"] == trained) & (pairs["tested"] == tested)]
+                        comparisons.append(
+                            compare_seeds(
+                                *_of_models(some, ("D" + mark, actions), ("T" + mark, "none")),
+                                condition=f"trained on {trained}, {how}, {by}",
+                                what=f"D / T, tested on {tested}",
+                            )
+                        )
+    return Claim(
+        "Trajectory models generalise across kinds of data",
+        "Trained on unstable or periodic data, T also predicts the other kinds, while one-step "
+        "models diverge unless they are trained and tested on unstable data.",
+        comparisons,
+        notes=[
+            "Unstable: without limits, as the paper's code comes to have it; survivors: unstable "
+            "gains redrawn until an episode stays within the limits."
+        ],
+        figure="data-types/data-types-unstable.png",
+    )
+
+
+def _of_models(
+    lines: pd.DataFrame, above: tuple[str, str], below: tuple[str, str]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Error far ahead of two models, seed by seed."""
+    by_model = lines.set_index(["model", "actions", "seed"])["long"].sort_index()
+    return by_model.loc[above].to_numpy(), by_model.loc[below].to_numpy()
+
+
 def planning(sources: Sources) -> Claim:
     seconds = sources["audit"]["planning"]
     by_way = seconds.set_index(["way", "candidates", "seed"])["seconds"]

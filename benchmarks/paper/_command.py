@@ -6,7 +6,6 @@ JSON file with the provenance, so that text and figures can be made again withou
 """
 
 import argparse
-import shutil
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +40,8 @@ class Run:
         Processes of this machine.
     workers : dict
         Further arguments of `run_cells`: where else to compute.
+    fresh : bool
+        Whether to forget the cells of earlier runs.
     """
 
     name: str
@@ -49,6 +50,7 @@ class Run:
     root: Path
     n_jobs: int
     workers: dict[str, Any]
+    fresh: bool = False
 
     @property
     def folder(self) -> Path:
@@ -64,7 +66,13 @@ class Run:
         """
         folder = self.root / (shared or self.name) / "cells" / self.mode
         return run_cells(
-            cells, function, folder, n_jobs=self.n_jobs, description=self.name, **self.workers
+            cells,
+            function,
+            folder,
+            n_jobs=self.n_jobs,
+            description=self.name,
+            fresh=self.fresh,
+            **self.workers,
         )
 
 
@@ -103,19 +111,22 @@ class Benchmark:
 
     def main(self, arguments: list[str] | None = None) -> None:
         """Run from the command line."""
-        options = self._parser().parse_args(arguments)
+        parser = self._parser()
+        options = parser.parse_args(arguments)
         mode = "quick" if options.quick else "full"
-        # a quick run never overwrites the results that the documentation quotes
         root = (options.out or (RESULTS if mode == "full" else Path("results"))).resolve()
+        if mode == "quick" and root.is_relative_to(RESULTS.resolve()):
+            parser.error(
+                f"a quick run never overwrites the results that the documentation quotes, in "
+                f"{RESULTS}: choose another folder with --out."
+            )
         folder = root / self.name
         if options.redraw:
             self._show(folder, read_tables(folder, self.name))
             return
-        if options.fresh:
-            shutil.rmtree(folder / "cells" / mode, ignore_errors=True)
         seeds = list(range(1 if options.quick else options.seeds))
         workers = {"scheduler": options.scheduler, "local_workers": options.local_workers}
-        tables = self.run(Run(self.name, mode, seeds, root, options.n_jobs, workers))
+        tables = self.run(Run(self.name, mode, seeds, root, options.n_jobs, workers, options.fresh))
         for stem, table in tables.items():
             write_csv(folder / f"{stem}.csv", table)
         facts = provenance(mode, seeds, **self.settings(mode))
@@ -129,18 +140,18 @@ class Benchmark:
 
     def _show(self, folder: Path, tables: Tables) -> None:
         """Text and figures of the tables as they are on disk: redrawing gives the same."""
-        import matplotlib as mpl
+        import matplotlib.pyplot as plt
 
-        mpl.use("Agg")
-        # the same picture gives the same bytes
-        mpl.rcParams["svg.hashsalt"] = self.name
+        plt.switch_backend("Agg")
         text = self.report(tables)
         (folder / f"{self.name}.md").write_text(text.rstrip() + "\n", encoding="utf-8")
         for stem, figure in self.draw(tables).items():
             figure.savefig(folder / f"{stem}.png", dpi=130, bbox_inches="tight")
-            nothing = {"Date": None}
-            figure.savefig(folder / f"{stem}.svg", bbox_inches="tight", metadata=nothing)
-            mpl.pyplot.close(figure)
+            # the same picture gives the same bytes: no date, no random names
+            with plt.rc_context({"svg.hashsalt": self.name}):
+                path = folder / f"{stem}.svg"
+                figure.savefig(path, bbox_inches="tight", metadata={"Date": None})
+            plt.close(figure)
         print(f"\n{text.rstrip()}\n\nWritten to {folder}.")
 
     def _parser(self) -> argparse.ArgumentParser:
@@ -155,8 +166,15 @@ class Benchmark:
         add("--quick", action="store_true", help="one seed, short training: minutes")
         add("--seeds", type=_positive, default=self.seeds, help="(default: %(default)s)")
         add("--n-jobs", type=int, default=2, help="processes (default: %(default)s)")
-        add("--local-workers", type=_positive, help="this many processes of a Dask cluster here")
-        add("--scheduler", metavar="ADDRESS", help="a Dask cluster, such as tcp://node:8786")
+        where = parser.add_mutually_exclusive_group()
+        where.add_argument(
+            "--local-workers", type=_positive, help="this many processes of a Dask cluster here"
+        )
+        where.add_argument(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="a Dask cluster, such as tcp://node:8786, whose workers run in the same checkout",
+        )
         add("--out", type=Path, help="folder of the results of all benchmarks")
         add("--fresh", action="store_true", help="forget the cells of earlier runs")
         add("--redraw", action="store_true", help="text and figures from the stored results")
@@ -165,10 +183,14 @@ class Benchmark:
 
 def read_tables(folder: Path, name: str) -> Tables:
     """Tables that a benchmark has stored in a folder."""
-    path = folder / f"{name}.json"
-    if not path.exists():
-        raise SystemExit(f"There are no results in {folder}: run without --redraw first.")
-    return {stem: pd.read_csv(folder / f"{stem}.csv") for stem in read_json(path)["tables"]}
+    try:
+        stems = read_json(folder / f"{name}.json")["tables"]
+        return {stem: pd.read_csv(folder / f"{stem}.csv") for stem in stems}
+    except FileNotFoundError as error:
+        raise SystemExit(
+            f"There are no results in {folder} ({Path(error.filename).name} is missing): "
+            "run without --redraw first."
+        ) from None
 
 
 def markdown(table: pd.DataFrame) -> str:

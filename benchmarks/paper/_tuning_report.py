@@ -14,6 +14,8 @@ from trajlearn.plotting._style import GREY, INK, line_style, tidy
 ACTIONS = {"none": "", "policy": "recomputed", "logged": "logged"}
 MARKS = {"final": " (paper)", "swept": "", "beyond": " (beyond)"}
 WITHIN = "within the spread"
+#: Panels in a row of a figure, at most.
+COLUMNS = 4
 
 
 def report(tables: Tables) -> str:
@@ -198,14 +200,15 @@ def _figure(scores: pd.DataFrame) -> Any:
 
 
 def _rows(groups: list[pd.DataFrame]) -> list[list[pd.DataFrame]]:
-    """Panels of each group in a row; small groups share one."""
-    split = [[some for _, some in group.groupby("parameter", sort=False)] for group in groups]
-    width, rows = max(map(len, split)), [[]]
-    for panels in split:
-        if len(rows[-1]) + len(panels) > width:
-            rows.append([])
-        rows[-1] += panels
-    return rows
+    """Panels of a group in rows of its own; small groups share one."""
+    rows: list[list[pd.DataFrame]] = [[]]
+    for group in groups:
+        panels = [some for _, some in group.groupby("parameter", sort=False)]
+        if len(rows[-1]) + len(panels) > COLUMNS:
+            rows += [panels[at : at + COLUMNS] for at in range(0, len(panels), COLUMNS)]
+        else:
+            rows[-1] += panels
+    return [row for row in rows if row]
 
 
 def _panel(ax: Any, scores: pd.DataFrame) -> None:

@@ -140,7 +140,7 @@ def draw(tables: Tables) -> dict[str, Any]:
     return {"action-source": draw_lines(curves, percentiles=True)}
 
 
-BENCHMARK = Benchmark("action-source", __doc__, run, report, draw, settings, minutes=8)
+BENCHMARK = Benchmark("action-source", __doc__, run, report, draw, settings, minutes=4)
 
 if __name__ == "__main__":
     BENCHMARK.main()

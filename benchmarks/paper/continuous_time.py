@@ -1,10 +1,10 @@
-"""Unevenly logged data, and predictions at times that no log has (the paper's section III).
+"""Unevenly logged data, and predictions at times that no log has.
 
-The paper says that T is agnostic to discrete or continuous time and can use data at any h, and
-does not test it. Here the controller acts at every control step, but the log keeps one state in
-four (or ten) on average: at random gaps ("irregular") or on a grid ("regular", as many states).
-Test episodes are asked for at every control step, at fresh irregular times, at twice the rate of
-the log, and on its grid.
+The paper says in section III that T is agnostic to discrete or continuous time, as it can use
+data at any h, and does not test it. Here the controller acts at every control step, but the log
+keeps one state in four (or ten) on average: at random gaps ("irregular") or on a grid ("regular",
+as many states). Test episodes are asked for at every control step, at fresh irregular times, at
+twice the rate of the log, and on its grid.
 
 - T takes any horizon and is asked directly. Between the times of a regular log its error is set
   against that on them, and against straight lines between its own predictions on them.
@@ -122,9 +122,9 @@ class Ratio(NamedTuple):
 
     @classmethod
     def of(cls, above: pd.Series, below: pd.Series) -> "Ratio":
-        """Ratio of two series by seed."""
-        values = above / below
-        return cls(float(values.median()), float(values.min()), float(values.max()))
+        """Ratio of two series by seed; NaN where both are infinite for some seed."""
+        values = (above / below).to_numpy()
+        return cls(float(np.median(values)), float(values.min()), float(values.max()))
 
     def __str__(self) -> str:
         return f"{self.middle:.2g}" + _spread(self.low, self.high)
@@ -250,7 +250,7 @@ def _contest(asked: pd.DataFrame) -> pd.DataFrame:
             rivals = asked[(asked["log"] == line[0]) & asked["model"].str[0].isin(list(letters))]
             for name in ASKED:
                 own = rivals[rivals["asked"] == name]
-                best = own.groupby(LINE)["median"].median().idxmin()
+                best: Any = own.groupby(LINE)["median"].median().idxmin()
                 ratio = Ratio.of(errors(*line, name), errors(*best, name))
                 row[name] = f"{ratio}: {_name(best[1:])}"
                 row.setdefault("verdict", ratio.word("wins", "draws", "loses"))

@@ -132,7 +132,7 @@ def _summary(errors: pd.DataFrame) -> pd.DataFrame:
         line: dict[str, Any] = {
             "epochs": epochs,
             "steps": some["steps"].iloc[0],
-            "rows": " or ".join(f"{n / 1e3:.3g}k" for n in seen),
+            "rows": " or ".join(f"{n:,}" for n in seen),
             "paper prints": f"{PRINTED[epochs]:.3g}",
         }
         for model in MODELS.values():
@@ -170,15 +170,17 @@ def _best(errors: pd.DataFrame) -> list[str]:
 
 def _gains(errors: pd.DataFrame) -> list[str]:
     """What the schedule and the rest of our settings buy with the same steps."""
-    table = errors.pivot(index=["epochs", "seed"], columns="model", values="mean").dropna()
+    table = errors.pivot(index=["epochs", "seed"], columns="model", values="mean")
     lines = []
+    others = {"one-cycle": "with a one-cycle schedule", "default": "of ours"}
     for epochs, some in table.groupby("epochs"):
-        ratios = {m: some[MODELS["paper"]] / some[MODELS[m]] for m in ("one-cycle", "default")}
-        lines.append(
-            f"With the steps of {epochs} epoch(s) the error of the paper's T is "
-            f"{_spread(ratios['one-cycle'])} times that under a one-cycle schedule, and "
-            f"{_spread(ratios['default'])} times that of ours."
-        )
+        known = {m: some[MODELS[m]] for m in others if some[MODELS[m]].notna().all()}
+        ratios = [
+            f"{_spread(some[MODELS['paper']] / of)} times that {others[m]}"
+            for m, of in known.items()
+        ]
+        if ratios:
+            lines.append(f"Error of T, epochs {epochs}: {', '.join(ratios)} (same steps).")
     return lines
 
 

@@ -201,7 +201,7 @@ def _draw_line(ax: "Axes", curve: pd.DataFrame, i: int, label: str, *, percentil
     draw_curve(ax, over, i, "", band=("middle", "q95"))
 
 
-BENCHMARK = Benchmark("horizon-error", __doc__, run, report, draw, settings, minutes=25)
+BENCHMARK = Benchmark("horizon-error", __doc__, run, report, draw, settings, minutes=20)
 
 if __name__ == "__main__":
     BENCHMARK.main()

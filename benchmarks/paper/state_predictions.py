@@ -270,7 +270,7 @@ def _say_diverges(
         )
 
 
-BENCHMARK = Benchmark("state-predictions", __doc__, run, report, draw, settings, minutes=8)
+BENCHMARK = Benchmark("state-predictions", __doc__, run, report, draw, settings, minutes=6)
 
 if __name__ == "__main__":
     BENCHMARK.main()

@@ -257,6 +257,9 @@ def test_words_need_all_seeds():
     ratio = continuous_time.Ratio.of(pd.Series([2.0, 3.0]), pd.Series([1.0, 4.0]))
     assert str(ratio) == "1.4 (0.75 to 2)"
     assert ratio.word("wins", "draws", "loses") == "draws"
+    both = continuous_time.Ratio.of(pd.Series([2.0, np.inf]), pd.Series([1.0, np.inf]))
+    assert np.isnan(both.middle)
+    assert both.word("wins", "draws", "loses") == "draws"
     assert continuous_time.Ratio(2.0, 1.2, 3.0).word("wins", "draws", "loses") == "loses"
     assert continuous_time.Ratio(0.5, 0.2, 0.8).word("wins", "draws", "loses") == "wins"
     assert continuous_time.Ratio(1.0, 0.95, 1.05).word("wins", "draws", "loses") == "draws"

@@ -35,14 +35,14 @@ def test_the_episode_has_the_median_error(errors, chosen):
 def test_a_line_diverges_if_it_stays_off():
     errors = np.array(
         [
-            # never, for a while, from step 3 on, from the start, at the end only
-            [0.1, 2.0, 0.1, 2.0, 0.1],
-            [0.1, 2.0, 0.1, 2.0, 0.1],
-            [1.0, 0.1, 1.1, 2.0, 0.1],
-            [0.1, 0.1, np.inf, 2.0, 9.0],
+            # never, for a while, from step 3 on, always, at the end only, for a while and again
+            [0.1, 2.0, 0.1, 2.0, 0.1, 2.0],
+            [0.1, 2.0, 0.1, 2.0, 0.1, 0.1],
+            [1.0, 0.1, 1.1, 2.0, 0.1, 2.0],
+            [0.1, 0.1, np.inf, 2.0, 9.0, 2.0],
         ]
     )
-    assert state_predictions.diverges_at(errors).tolist() == [0, 0, 3, 1, 4]
+    assert state_predictions.diverges_at(errors).tolist() == [0, 0, 3, 1, 4, 3]
 
 
 def test_stored_steps_cover_the_horizon():
