@@ -61,10 +61,8 @@ def test_report_finds_the_best_epochs_of_each_seed(tables):
     assert "by the mean: 8 (seed 0), 16 (seed 1)" in text
     assert "8 epochs are best on 1 of 2 seeds; their error is +50% (+0% to +100%)" in text
     assert "From 8 to 16 epochs it changes by +25% (-50% to +100%); in the paper by +7%" in text
-    gain = (
-        "Error of T, epochs 16: 1 (1 to 1) times that with a one-cycle schedule, 2 (2 to 2) times"
-    )
-    assert gain in text
+    assert "Error of T, epochs 16: 1 (1 to 1) times that with a one-cycle schedule" in text
+    assert "2 (2 to 2) times that of ours" in text
     tables["errors"] = tables["errors"].query("model != 'T, one-cycle' or epochs < 16")
     assert "Error of T, epochs 16: 2 (2 to 2) times that of ours" in epochs.report(tables)
 

@@ -172,3 +172,11 @@ def test_the_whole_command(small, tmp_path, monkeypatch, capsys):
     assert by_parameter[0] == by_parameter[1]
     for name in ("D", "T"):
         assert (tmp_path / "tuning" / f"tuning-{name}.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("sizes", "rows"), [([4, 4, 1, 1], [4, 4, 2]), ([6, 4], [4, 2, 4]), ([1], [1]), ([5], [4, 1])]
+)
+def test_small_groups_of_panels_share_a_row(sizes, rows):
+    groups = [pd.DataFrame({"parameter": [f"p{i}" for i in range(n)]}) for n in sizes]
+    assert [len(row) for row in _tuning_report._rows(groups)] == rows
