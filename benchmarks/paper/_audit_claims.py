@@ -11,6 +11,7 @@ import pandas as pd
 from benchmarks.paper._claims import Claim, Comparison, compare, compare_seeds, number
 from benchmarks.paper._command import Tables
 from benchmarks.paper._tasks import TASKS
+from benchmarks.paper.continuous_time import lost_between
 
 Sources = dict[str, Tables]
 
@@ -31,7 +32,6 @@ def claims(sources: Sources) -> list[Claim]:
         ensembles(sources),
         trajectory_ensembles(sources),
         sample_efficiency(sources),
-        reward_prediction(sources),
         data_types(sources),
         planning(sources),
         continuous_time(sources),
@@ -317,6 +317,64 @@ def planning(sources: Sources) -> Claim:
             "Bare networks of the same size in plain torch on one CPU thread, 200 steps; this "
             "library's overhead is not in these numbers (see benchmarks/speed)."
         ],
+    )
+
+
+#: One-step models of an uneven or thinned log that are asked between its times, as a rival of T.
+_RIVALS = {
+    "irregular": {
+        "C with the time step": ("C with dt (ours)", "none", "long steps"),
+        "D with the time step, recomputed": ("D with dt (ours)", "policy", "long steps"),
+    },
+    "regular": {
+        "C, straight lines between steps": ("C (ours)", "none", "linear"),
+        "D, recomputed, straight lines between steps": ("D (ours)", "policy", "linear"),
+    },
+}
+
+
+def continuous_time(sources: Sources) -> Claim:
+    tables = sources["continuous-time"]
+    keys = ["task", "interval"]
+    places = dict(iter(tables["distances"].groupby(keys, sort=False)))
+    comparisons = []
+    for (task, interval), asked in tables["asked"].groupby(keys, sort=False):
+        where = f"{task}, a state every {interval:g} s"
+        lost = lost_between(places[task, interval], "T (ours)")
+        comparisons.append(
+            Comparison(
+                f"{where}: between the times of a regular log",
+                "T off the grid / on it",
+                lost.middle,
+                np.nan,
+                np.nan,
+                (lost.low, lost.high),
+                same=True,
+            )
+        )
+        every = asked[asked["asked"] == "every step"]
+        errors = every.set_index(["log", "model", "actions", "way", "seed"])["median"].sort_index()
+        for log, rivals in _RIVALS.items():
+            own = errors.loc[log, "T (ours)", "none", "direct"].to_numpy()
+            for name, rival in rivals.items():
+                comparisons.append(
+                    compare_seeds(
+                        errors.loc[log, *rival].to_numpy(),
+                        own,
+                        condition=f"{where}: against one-step models of the same {log} log",
+                        what=f"{name} / T",
+                    )
+                )
+    return Claim(
+        "Trajectory models work in continuous time",
+        "T is agnostic to discrete or continuous time: it can learn from data at any horizon and "
+        "interpolate between them. (Not tested in the paper.)",
+        comparisons,
+        notes=[
+            "All models are tuned (our defaults) and asked for every control step; errors between "
+            "the times of a log are set against those on them, corrected for the times."
+        ],
+        figure="continuous-time/continuous-time.png",
     )
 
 

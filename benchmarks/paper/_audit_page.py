@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from benchmarks.paper._claims import SAME, Claim, Comparison, number
+from benchmarks.paper._claims import SAME, Claim, Comparison, from_tables, number
 from benchmarks.paper._command import Tables, markdown
 from benchmarks.paper._intervals import spread
 
@@ -27,26 +27,15 @@ every seed agree, otherwise it is open. *Holds* means that all comparisons speak
 """
 
 
-def page(
-    claims: Sequence[Claim], tables: Tables, sources: dict[str, Tables], modes: dict[str, str]
-) -> str:
-    """The page as Markdown.
-
-    Parameters
-    ----------
-    claims : sequence of Claim
-    tables : dict of DataFrame
-        Of the audit's own ablations.
-    sources : dict from benchmark to its tables
-    modes : dict from benchmark to what its results are, such as "full, 3 seeds, commit ..."
-    """
+def page(tables: Tables) -> str:
+    """The page as Markdown, from the tables of the audit alone."""
+    claims = from_tables(tables)
     parts = [_HEAD, "## Verdicts", "", markdown(_overview(claims)), ""]
     parts += ["## Claim by claim", ""]
     for i, claim in enumerate(claims, 1):
         parts += _section(i, claim)
-    parts += ["## Why the paper saw something else", "", *reasons(tables, sources)]
-    parts += ["## Where the numbers come from", ""]
-    parts += [markdown(pd.DataFrame({"benchmark": list(modes), "results": list(modes.values())}))]
+    parts += ["## Why the paper saw something else", "", *reasons(tables)]
+    parts += ["## Where the numbers come from", "", markdown(tables["sources"])]
     return "\n".join(parts).rstrip() + "\n"
 
 
@@ -113,7 +102,7 @@ def _interval(one: Comparison) -> str:
 # -- reasons --------------------------------------------------------------------------------------
 
 
-def reasons(tables: Tables, sources: dict[str, Tables]) -> list[str]:
+def reasons(tables: Tables) -> list[str]:
     """The ablations, one after the other."""
     return [
         "### The reward table, reproduced with its defects",
@@ -143,7 +132,7 @@ def reasons(tables: Tables, sources: dict[str, Tables]) -> list[str]:
         "stays stable, while recomputed actions are inputs that the model never saw. One-step "
         "model D, median error from step 51 to the training length.",
         "",
-        markdown(late_table(tables["late"], sources)),
+        markdown(late_table(tables["late"])),
         "",
         "### Unequal budgets",
         "",
@@ -176,6 +165,9 @@ PRINTED = {
     ("reacher", "D", "policy"): 0.072,
     ("reacher", "T", "none"): 0.005,
 }
+
+
+_SOURCE = {"logged": ", recorded", "policy": ", recomputed"}
 
 
 def reward_table(rewards: pd.DataFrame) -> pd.DataFrame:
@@ -217,22 +209,15 @@ def _first_of_task(rewards: pd.DataFrame) -> Any:
     return trained.groupby("task", sort=False)
 
 
-def late_table(late: pd.DataFrame, sources: dict[str, Tables]) -> pd.DataFrame:
+def late_table(late: pd.DataFrame) -> pd.DataFrame:
     """Error of D by alignment, source of actions and settings."""
-    aligned = sources["horizon-error"]["episodes"]
     lines = []
     for (task, settings), some in late.groupby(["task", "settings"], sort=False):
-        model = {"paper": "D", "default": "D (ours)"}[str(settings)]
         line: dict[str, Any] = {"task": task, "settings": settings}
         for actions, name in (("logged", "recorded"), ("policy", "recomputed")):
-            right = aligned[
-                (aligned["task"] == task)
-                & (aligned["model"] == model)
-                & (aligned["actions"] == actions)
-            ]
-            wrong = some[some["actions"] == actions]
-            for title, chosen in (("late", wrong), ("aligned", right)):
-                line[f"{title}, {name}"] = spread(chosen.groupby("seed")["long"].median())
+            for alignment in ("late", "aligned"):
+                chosen = some[(some["actions"] == actions) & (some["alignment"] == alignment)]
+                line[f"{alignment}, {name}"] = spread(chosen["long"])
         lines.append(line)
     return pd.DataFrame(lines)
 
@@ -245,7 +230,7 @@ def budget_table(budget: pd.DataFrame) -> pd.DataFrame:
     for (model, n_train, how, actions), some in budget.groupby(keys, sort=False):
         line = {"model": model, "training episodes": n_train, "training": titles[str(how)]}
         line |= {"actions": {"policy": "recomputed"}.get(str(actions), actions)}
-        lines.append(line | {"error": spread(some.groupby("seed")["long"].median())})
+        lines.append(line | {"error": spread(some["long"])})
     return pd.DataFrame(lines)
 
 

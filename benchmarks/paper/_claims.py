@@ -1,7 +1,7 @@
 """The paper's claims as comparisons that can fail, and the verdict that follows from them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -92,6 +92,46 @@ class Claim:
         if not ratios:
             return ""
         return f"{number(min(ratios))} to {number(max(ratios))}"
+
+
+def to_tables(claims: Sequence[Claim]) -> dict[str, pd.DataFrame]:
+    """Claims as two tables: ``claims``, a line each, and ``comparisons``."""
+    statements = [
+        {
+            "claim": one.title,
+            "says": one.says,
+            "figure": one.figure or "",
+            "notes": "\n".join(one.notes),
+        }
+        for one in claims
+    ]
+    comparisons = [
+        {"claim": claim.title}
+        | asdict(one)
+        | {"seeds": " ".join(f"{value:.5g}" for value in one.seeds)}
+        for claim in claims
+        for one in claim.comparisons
+    ]
+    return {"claims": pd.DataFrame(statements), "comparisons": pd.DataFrame(comparisons)}
+
+
+def from_tables(tables: dict[str, pd.DataFrame]) -> list[Claim]:
+    """Claims that `to_tables` wrote."""
+    measured: dict[str, list[Comparison]] = {}
+    for line in tables["comparisons"].to_dict("records"):
+        title = line.pop("claim")
+        seeds = tuple(float(value) for value in str(line.pop("seeds")).split())
+        measured.setdefault(title, []).append(Comparison(**line, seeds=seeds))
+    return [
+        Claim(
+            line["claim"],
+            line["says"],
+            measured.get(line["claim"], []),
+            notes=line["notes"].splitlines(),
+            figure=line["figure"] or None,
+        )
+        for line in tables["claims"].fillna("").to_dict("records")
+    ]
 
 
 def number(value: float) -> str:

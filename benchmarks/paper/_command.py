@@ -98,6 +98,8 @@ class Benchmark:
         That a full run takes on two cores, about.
     seeds : int
         Of a full run.
+    publish : Path, optional
+        Page of the documentation that the report of the committed results becomes.
     """
 
     name: str
@@ -108,6 +110,7 @@ class Benchmark:
     settings: Callable[[str], dict[str, Any]]
     minutes: int
     seeds: int = 3
+    publish: Path | None = None
 
     def main(self, arguments: list[str] | None = None) -> None:
         """Run from the command line."""
@@ -144,7 +147,9 @@ class Benchmark:
 
         plt.switch_backend("Agg")
         text = self.report(tables)
-        (folder / f"{self.name}.md").write_text(text.rstrip() + "\n", encoding="utf-8")
+        published = self.publish is not None and folder.parent == RESULTS.resolve()
+        page = self.publish if published else folder / f"{self.name}.md"
+        page.write_text(text.rstrip() + "\n", encoding="utf-8")
         for stem, figure in self.draw(tables).items():
             figure.savefig(folder / f"{stem}.png", dpi=130, bbox_inches="tight")
             # the same picture gives the same bytes: no date, no random names

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from benchmarks._results import read_json
 from benchmarks.paper._ablations import (
     GP_SHARE,
     NN_STEPS,
@@ -25,6 +26,7 @@ from benchmarks.paper._ablations import (
 from benchmarks.paper._command import Run, Tables
 from benchmarks.paper._rollouts import N_TEST
 from benchmarks.paper._tasks import N_EPISODES, TASKS
+from trajlearn.plotting._style import GREY, tidy
 
 DOCS = Path(__file__).parents[2] / "docs" / "audit.md"
 #: Benchmarks whose stored tables the audit reads.
@@ -40,15 +42,15 @@ SOURCES = (
 
 
 def run(run: Run) -> Tables:
-    """Tables of the ablations."""
+    """Tables of the ablations, and the claims as the stored results judge them."""
     results = {
         function: list(zip(cells, run.cells(cells, function), strict=True))
         for function, cells in plan(run.mode, run.seeds).items()
     }
-    return {
+    ablations = {
         "rewards": _rewards(results[reward_cell]),
-        "late": _by_episode(results[late_cell]),
-        "budget": _by_episode(results[budget_cell]),
+        "late": _medians(results[late_cell]).assign(alignment="late"),
+        "budget": _medians(results[budget_cell]),
         "untrained": _rewards(results[untrained_cell]),
         "planning": pd.DataFrame(
             {"candidates": asked["candidates"], "seed": asked["seed"], "way": way, "seconds": taken}
@@ -56,6 +58,32 @@ def run(run: Run) -> Tables:
             for way, taken in result.items()
         ),
     }
+    stored = {name: read_tables(run.root / name, name) for name in SOURCES}
+    aligned = _aligned(stored["horizon-error"]["episodes"])
+    ablations["late"] = pd.concat([ablations["late"], aligned], ignore_index=True)
+    judged = claims(stored | {"audit": ablations})
+    return to_tables(judged) | ablations | {"sources": _provenance(run)}
+
+
+def _aligned(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Medians of the same models with aligned actions, from the benchmark that has them."""
+    settings = {"D": "paper", "D (ours)": "default"}
+    some = episodes[episodes["model"].isin(settings)]
+    some = some.assign(settings=some["model"].map(settings), alignment="aligned")
+    keys = ["task", "settings", "actions", "seed", "alignment"]
+    return some.groupby(keys, sort=False)[["short", "long", "beyond"]].median().reset_index()
+
+
+def _provenance(run: Run) -> pd.DataFrame:
+    """What the results of the other benchmarks are."""
+    lines = []
+    for name in SOURCES:
+        facts = read_json(run.root / name / f"{name}.json")
+        seeds = len(facts["seeds"])
+        lines.append(
+            {"benchmark": name, "mode": facts["mode"], "seeds": seeds, "commit": facts["commit"]}
+        )
+    return pd.DataFrame(lines)
 
 
 Results = list[tuple[dict[str, Any], Any]]
@@ -76,16 +104,15 @@ def _rewards(results: Results) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def _by_episode(results: Results) -> pd.DataFrame:
-    """A line a test episode, with its mean error in each window."""
-    tables = []
+def _medians(results: Results) -> pd.DataFrame:
+    """A line a fit and source of actions: the median over episodes in each window."""
+    lines = []
     for asked, result in results:
         for actions, windows in result.items():
             line = {key: value for key, value in asked.items() if key != "mode"}
-            n = len(windows["within"])
-            table = line | {"actions": actions, "episode": range(n)} | windows
-            tables.append(pd.DataFrame(table))
-    return pd.concat(tables, ignore_index=True)
+            medians = {name: float(np.median(errors)) for name, errors in windows.items()}
+            lines.append(line | {"actions": actions} | medians)
+    return pd.DataFrame(lines)
 
 
 def settings(mode: str) -> dict[str, Any]:
@@ -97,3 +124,45 @@ def settings(mode: str) -> dict[str, Any]:
         "gp_share": GP_SHARE,
         "nn_steps": NN_STEPS[mode],
     }
+
+
+def draw(tables: Tables) -> dict[str, Any]:
+    """All comparisons at a glance: ratios by claim, on a logarithmic axis."""
+    import matplotlib.pyplot as plt
+
+    judged = from_tables(tables)
+    figure, ax = plt.subplots(figsize=(8.0, 0.9 + 0.42 * len(judged)), layout="constrained")
+    looks = {"for": ("o", "#0072B2"), "against": ("X", "#D55E00"), "open": ("s", GREY)}
+    for row, claim in enumerate(judged):
+        for verdict, (marker, colour) in looks.items():
+            some = [one.estimate for one in claim.comparisons if one.verdict == verdict]
+            at = row + {"for": -0.18, "against": 0.18, "open": 0.0}[verdict]
+            shown = np.clip(some, *_SHOWN)
+            label = f"speaks {verdict}" if verdict != "open" else "open"
+            ax.plot(
+                shown,
+                np.full(len(some), at),
+                marker,
+                ms=5,
+                mec=colour,
+                mfc="none" if verdict == "against" else colour,
+                label=label if row == 0 else None,
+            )
+    ax.axvline(1.0, color=GREY, lw=1, ls="dotted")
+    ax.set_xscale("log")
+    ax.set_xlim(_SHOWN[0] / 2, _SHOWN[1] * 2)
+    ax.set_yticks(range(len(judged)), [f"{i}. {c.title}" for i, c in enumerate(judged, 1)])
+    ax.invert_yaxis()
+    ax.set_xlabel("ratio; above 1 it speaks for the claim (ends of the axis: beyond)")
+    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    tidy(ax)
+    return {"audit": figure}
+
+
+# ratios drawn; further ones lie at the ends
+_SHOWN = (1e-4, 1e4)
+
+BENCHMARK = Benchmark("audit", __doc__, run, page, draw, settings, minutes=15, publish=DOCS)
+
+if __name__ == "__main__":
+    BENCHMARK.main()

@@ -153,7 +153,7 @@ def report(tables: Tables) -> str:
     for key, asked in tables["asked"].groupby(keys, sort=False):
         name = f"{key[0]}, {key[1]:g} s"
         for model in ("T (ours)", "T"):
-            ratio = _lost_between(places[key], model)
+            ratio = lost_between(places[key], model)
             loses = ratio.word("less than nothing", "nothing", "something")
             unseen.append(f"- {model}, {name}: {loses}, {ratio}.")
         contest = _contest(asked)
@@ -187,7 +187,7 @@ _ABOUT = [
 ]
 
 
-def _lost_between(places: pd.DataFrame, model: str) -> Ratio:
+def lost_between(places: pd.DataFrame, model: str) -> Ratio:
     """Error of T off the grid over that on it, past the first interval; 1 if nothing is lost.
 
     The times on the grid and off it differ, and the error changes with time: T of the irregular

@@ -4,7 +4,7 @@ import ast
 import json
 import runpy
 import sys
-import warnings
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 
@@ -186,8 +186,6 @@ def test_quick_and_full_cells_do_not_mix(benchmark, log, tmp_path):
 
 
 def test_benchmarks_share_cells_and_fresh_forgets_those_too(benchmark, log, tmp_path):
-    from dataclasses import replace
-
     def shared(run):
         return benchmark.run(run, shared="fits")
 
@@ -251,12 +249,12 @@ def test_markdown_rounds_and_leaves_missing_entries_blank():
     assert markdown(table) == text
 
 
+# that another test has imported the module
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
 @pytest.mark.parametrize("path", MODULES, ids=lambda path: path.stem)
 def test_help_of_every_benchmark(path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [path.stem, "--help"])
-    with pytest.raises(SystemExit) as caught, warnings.catch_warnings():
-        # another test may have imported the module
-        warnings.simplefilter("ignore", RuntimeWarning)
+    with pytest.raises(SystemExit) as caught:
         runpy.run_module(f"benchmarks.paper.{path.stem}", run_name="__main__")
     assert caught.value.code == 0
     printed = capsys.readouterr().out
