@@ -23,7 +23,10 @@ from benchmarks.paper._ablations import (
     reward_cell,
     untrained_cell,
 )
-from benchmarks.paper._command import Run, Tables
+from benchmarks.paper._audit_claims import claims
+from benchmarks.paper._audit_page import page
+from benchmarks.paper._claims import from_tables, to_tables
+from benchmarks.paper._command import Benchmark, Run, Tables, read_tables
 from benchmarks.paper._rollouts import N_TEST
 from benchmarks.paper._tasks import N_EPISODES, TASKS
 from trajlearn.plotting._style import GREY, tidy
