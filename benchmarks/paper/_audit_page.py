@@ -63,8 +63,8 @@ def _section(i: int, claim: Claim) -> list[str]:
     lines += [*(f"{note}\n" for note in claim.notes)]
     if claim.figure:
         lines += [f"![{claim.title}](../benchmarks/paper/results/{claim.figure})", ""]
-    lines += ["```{dropdown} All comparisons", "", markdown(_comparisons(claim)), "", "```", ""]
-    return lines
+    lines += ["<details>", "<summary>All comparisons</summary>", ""]
+    return [*lines, markdown(_comparisons(claim)), "", "</details>", ""]
 
 
 def _conditions(claim: Claim) -> str:

@@ -7,7 +7,7 @@ JSON file with the provenance, so that text and figures can be made again withou
 
 import argparse
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -42,6 +42,8 @@ class Run:
         Further arguments of `run_cells`: where else to compute.
     fresh : bool
         Whether to forget the cells of earlier runs.
+    task : str, optional
+        The one to run, of a benchmark with a result for each task.
     """
 
     name: str
@@ -51,6 +53,7 @@ class Run:
     n_jobs: int
     workers: dict[str, Any]
     fresh: bool = False
+    task: str | None = None
 
     @property
     def folder(self) -> Path:
@@ -70,7 +73,7 @@ class Run:
             function,
             folder,
             n_jobs=self.n_jobs,
-            description=self.name,
+            description=" ".join(filter(None, (self.name, self.task))),
             fresh=self.fresh,
             **self.workers,
         )
@@ -100,6 +103,9 @@ class Benchmark:
         Of a full run.
     publish : Path, optional
         Page of the documentation that the report of the committed results becomes.
+    tasks : tuple of str
+        Each has a result of its own, in files named after the task; ``--task`` chooses one.
+        `run` finds it in ``run.task``, and `settings` gives a dict for each of them.
     """
 
     name: str
@@ -111,6 +117,7 @@ class Benchmark:
     minutes: int
     seeds: int = 3
     publish: Path | None = None
+    tasks: tuple[str, ...] = ()
 
     def main(self, arguments: list[str] | None = None) -> None:
         """Run from the command line."""
@@ -124,31 +131,37 @@ class Benchmark:
                 f"{RESULTS}: choose another folder with --out."
             )
         folder = root / self.name
-        if options.redraw:
-            self._show(folder, read_tables(folder, self.name))
-            return
         seeds = list(range(1 if options.quick else options.seeds))
         workers = {"scheduler": options.scheduler, "local_workers": options.local_workers}
-        tables = self.run(Run(self.name, mode, seeds, root, options.n_jobs, workers, options.fresh))
-        for stem, table in tables.items():
-            write_csv(folder / f"{stem}.csv", table)
-        facts = provenance(mode, seeds, **self.settings(mode))
-        write_json(folder / f"{self.name}.json", facts | {"tables": list(tables)})
-        self._show(folder, read_tables(folder, self.name))
-        if mode == "quick":
+        whole = Run(self.name, mode, seeds, root, options.n_jobs, workers, options.fresh)
+        tasks = [options.task] if self.tasks and options.task else self.tasks or [None]
+        for run in [replace(whole, task=task) for task in tasks]:
+            if not options.redraw:
+                self._store(run, folder)
+            self._show(folder, run.task or self.name)
+        if mode == "quick" and not options.redraw:
             print(
                 "This was the quick mode: one seed, short training. The full run, about "
                 f"{self.minutes} minutes on two cores: .venv/bin/trajlearn reproduce {self.name}"
             )
 
-    def _show(self, folder: Path, tables: Tables) -> None:
+    def _store(self, run: Run, folder: Path) -> None:
+        """Run, and write the tables and what a reader must know of them."""
+        tables, settings = self.run(run), self.settings(run.mode)
+        for stem, table in tables.items():
+            write_csv(folder / f"{stem}.csv", table)
+        facts = provenance(run.mode, run.seeds, **(settings[run.task] if run.task else settings))
+        write_json(folder / f"{run.task or self.name}.json", facts | {"tables": list(tables)})
+
+    def _show(self, folder: Path, result: str) -> None:
         """Text and figures of the tables as they are on disk: redrawing gives the same."""
         import matplotlib.pyplot as plt
 
         plt.switch_backend("Agg")
+        tables = read_tables(folder, result)
         text = self.report(tables)
         published = self.publish is not None and folder.parent == RESULTS.resolve()
-        page = self.publish if published else folder / f"{self.name}.md"
+        page = self.publish if published else folder / f"{result}.md"
         page.write_text(text.rstrip() + "\n", encoding="utf-8")
         for stem, figure in self.draw(tables).items():
             figure.savefig(folder / f"{stem}.png", dpi=130, bbox_inches="tight")
@@ -168,6 +181,8 @@ class Benchmark:
             "it was.",
         )
         add = parser.add_argument
+        if self.tasks:
+            add("--task", choices=self.tasks, help="(default: all)")
         add("--quick", action="store_true", help="one seed, short training: minutes")
         add("--seeds", type=_positive, default=self.seeds, help="(default: %(default)s)")
         add("--n-jobs", type=int, default=2, help="processes (default: %(default)s)")
@@ -187,7 +202,7 @@ class Benchmark:
 
 
 def read_tables(folder: Path, name: str) -> Tables:
-    """Tables that a benchmark has stored in a folder."""
+    """Tables that a benchmark (or one of its tasks, by name) has stored in a folder."""
     try:
         stems = read_json(folder / f"{name}.json")["tables"]
         return {stem: pd.read_csv(folder / f"{stem}.csv") for stem in stems}

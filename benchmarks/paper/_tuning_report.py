@@ -7,7 +7,7 @@ import pandas as pd
 
 from benchmarks.paper._command import Tables, markdown
 from benchmarks.paper._figures import ERROR, legend_below
-from benchmarks.paper._grids import shown
+from benchmarks.paper._grids import TRAINED, shown
 from trajlearn.plotting._style import GREY, INK, line_style, tidy
 
 #: How sources of actions and origins of values are written.
@@ -32,6 +32,11 @@ def report(tables: Tables) -> str:
         f"value is better on average but not on every fold of every seed; in {holds.get('no', 0)} "
         "one is better on all of them.",
         "Ratios are of one fold and seed: median (least to greatest).",
+        "Training is shorter than the paper's final one (its steps are listed), which favours "
+        "large rates and small",
+        "batches; always Adam. The LSTM's width and depth are not swept. `rows` are the paper's "
+        "caps, of which it trained",
+        f"on {TRAINED:.0%}; with `same steps` more rows do not mean more steps.",
         "",
         markdown(verdicts),
         "",
