@@ -32,6 +32,7 @@ def claims(sources: Sources) -> list[Claim]:
         ensembles(sources),
         trajectory_ensembles(sources),
         sample_efficiency(sources),
+        reward_prediction(sources),
         data_types(sources),
         planning(sources),
         continuous_time(sources),
@@ -256,6 +257,35 @@ def _growth_of_data(errors: pd.DataFrame, data: pd.DataFrame) -> str:
         f"that of D with recomputed actions by {falls('D', 'policy')} (ours: "
         f"{falls('D (ours)', 'policy')}). The pairs are not independent: they come from the same "
         "episodes."
+    )
+
+
+def reward_prediction(sources: Sources) -> Claim:
+    rivals = {
+        "paper": ["GP", "NN", "D, logged actions", "D, predicted actions"],
+        "tuned": ["GP", "NN", "D, logged actions", "D, predicted actions", "C"],
+    }
+    titles = {"paper": "paper's settings", "tuned": "tuned on training episodes"}
+    comparisons = []
+    for task, records in sources["reward-table"].items():
+        errors = records.set_index(["settings", "row", "seed"])["mean"].sort_index()
+        for settings, rows in rivals.items():
+            own = errors.loc[settings, "T"].to_numpy()
+            comparisons += [
+                compare_seeds(
+                    errors.loc[settings, row].to_numpy(),
+                    own,
+                    condition=f"{task}, {titles[settings]}, against {row}",
+                    what="mean squared error of the reward, over that of T",
+                )
+                for row in rows
+            ]
+    return Claim(
+        "Trajectory models predict the reward of an episode best",
+        "T has the least squared error of the episode's reward: 90 times less than a Gaussian "
+        "process on cartpole, 14 times less than the next best method on reacher.",
+        comparisons,
+        figure="reward-table/cartpole.png",
     )
 
 

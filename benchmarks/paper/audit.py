@@ -61,7 +61,9 @@ def run(run: Run) -> Tables:
             for way, taken in result.items()
         ),
     }
-    stored = {name: read_tables(run.root / name, name) for name in SOURCES}
+    stored: dict[str, Tables] = {}
+    for benchmark, result in _results():
+        stored.setdefault(benchmark, {}).update(read_tables(run.root / benchmark, result))
     aligned = _aligned(stored["horizon-error"]["episodes"])
     ablations["late"] = pd.concat([ablations["late"], aligned], ignore_index=True)
     judged = claims(stored | {"audit": ablations})
@@ -77,22 +79,27 @@ def _aligned(episodes: pd.DataFrame) -> pd.DataFrame:
     return some.groupby(keys, sort=False)[["short", "long", "beyond"]].median().reset_index()
 
 
+def _results() -> list[tuple[str, str]]:
+    """Benchmarks that are read, each with the names of its results."""
+    tasks = {"reward-table": list(TASKS)}
+    return [(name, result) for name in SOURCES for result in tasks.get(name, [name])]
+
+
 def _provenance(run: Run) -> pd.DataFrame:
     """What the results of the other benchmarks are."""
     lines = []
-    for name in SOURCES:
-        facts = read_json(run.root / name / f"{name}.json")
-        seeds = len(facts["seeds"])
-        lines.append(
-            {"benchmark": name, "mode": facts["mode"], "seeds": seeds, "commit": facts["commit"]}
-        )
+    for name, result in _results():
+        facts = read_json(run.root / name / f"{result}.json")
+        line = {"benchmark": name if name == result else f"{name}, {result}"}
+        line |= {"mode": facts["mode"], "seeds": len(facts["seeds"]), "commit": facts["commit"]}
+        lines.append(line)
     return pd.DataFrame(lines)
 
 
-Results = list[tuple[dict[str, Any], Any]]
+_Cells = list[tuple[dict[str, Any], Any]]
 
 
-def _rewards(results: Results) -> pd.DataFrame:
+def _rewards(results: _Cells) -> pd.DataFrame:
     """A line a fit and set of episodes: the squared error, and that of all pairs."""
     lines = []
     for asked, result in results:
@@ -107,7 +114,7 @@ def _rewards(results: Results) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def _medians(results: Results) -> pd.DataFrame:
+def _medians(results: _Cells) -> pd.DataFrame:
     """A line a fit and source of actions: the median over episodes in each window."""
     lines = []
     for asked, result in results:

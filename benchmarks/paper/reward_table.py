@@ -134,7 +134,7 @@ def _spread(values: pd.Series) -> float:
 def brief(task: str, records: pd.DataFrame) -> str:
     """Compact Markdown table for the README: one line a method, one column a kind of settings."""
     frame = table(task, records).set_index(["settings", "method"])
-    own_goals = frame["MSE, own goals"].notna().any()
+    own_goals = bool(frame["MSE, own goals"].notna().any())
 
     def entry(settings: str, method: str, column: str = "MSE") -> str:
         if (settings, method) not in frame.index:
@@ -147,7 +147,7 @@ def brief(task: str, records: pd.DataFrame) -> str:
             return f"{line[column]:.2g}"
         return f"{line['MSE']:.2g} ± {line['MSE std over seeds']:.1g}"
 
-    columns = ["paper prints"] + ["its protocol, actions aligned"] * own_goals
+    columns = ["paper prints"] + ["its settings, own goals"] * own_goals
     columns += ["its settings, actions aligned", "tuned", "library defaults"]
     lines = ["| method | " + " | ".join(columns) + " |", "|---|" + "---|" * len(columns)]
     known = set(frame.index.get_level_values("method"))

@@ -26,7 +26,7 @@ def test_the_page_is_made_from_the_committed_tables(stored):
 
 def test_it_rests_on_full_runs_of_three_seeds(stored):
     sources = stored["sources"]
-    assert sources["benchmark"].tolist() == list(audit.SOURCES)
+    assert {name.partition(",")[0] for name in sources["benchmark"]} == set(audit.SOURCES)
     assert set(sources["mode"]) == {"full"}
     assert sources["seeds"].min() >= 3
     assert all(stored[name]["seed"].nunique() >= 3 for name in ("rewards", "late", "planning"))
