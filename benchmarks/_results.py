@@ -38,7 +38,7 @@ def write_json(path: Path, payload: Any) -> None:
     """Write JSON atomically; numbers keep five significant digits, infinities become text."""
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    part.write_text(json.dumps(_plain(payload), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    part.write_text(json.dumps(plain(payload), indent=1, allow_nan=False) + "\n", encoding="utf-8")
     os.replace(part, path)
 
 
@@ -55,13 +55,13 @@ def write_csv(path: Path, table: pd.DataFrame) -> None:
     os.replace(part, path)
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if hasattr(value, "tolist"):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, float):
         return float(f"{value:.5g}") if abs(value) < float("inf") else str(value)
     return value

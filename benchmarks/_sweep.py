@@ -12,7 +12,7 @@ from joblib import Parallel, delayed, parallel_config
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from benchmarks._results import _plain, read_json, write_json
+from benchmarks._results import plain, read_json, write_json
 
 Cell = dict[str, Any]
 
@@ -109,7 +109,7 @@ def _run(number: int, function: Callable[..., Any], cell: Cell) -> Outcome:
     torch.set_num_threads(1)
     with threadpool_limits(1), parallel_config("sequential"):
         try:
-            result = _plain(function(**cell))
+            result = plain(function(**cell))
             json.dumps(result)  # what no file can hold fails here, as the cell's own failure
         except Exception:
             return Outcome(number, failure=traceback.format_exc())

@@ -42,10 +42,8 @@ def benchmark(log, tmp_path, monkeypatch):
         table = pd.concat([pd.DataFrame(result) for result in results], ignore_index=True)
         # what a table cannot hold to the last digit tells the stored one from the fresh one
         table["third"] = 1 / 3
-        return {
-            "errors": table,
-            "summary": table[["horizon", "error"]].groupby("horizon").median().reset_index(),
-        }
+        summary = table.groupby("horizon")[["error"]].median().reset_index()
+        return {"errors": table, "summary": summary}
 
     def draw(tables):
         import matplotlib.pyplot as plt
@@ -122,9 +120,11 @@ def test_redrawing_shows_what_the_tables_say(benchmark, tmp_path):
     folder = tmp_path / "committed" / "tiny"
     before = contents(folder)
     pd.DataFrame({"horizon": [8], "error": [0.25]}).to_csv(folder / "summary.csv", index=False)
-    pd.DataFrame({"horizon": [8, 9], "error": [1, 2]}).to_csv(folder / "errors.csv", index=False)
+    errors = pd.DataFrame({"horizon": [8, 9], "error": [1, 2], "third": 7})
+    errors.to_csv(folder / "errors.csv", index=False)
     benchmark.main(["--redraw"])
     after = contents(folder)
+    assert after["tiny.md"].startswith(b"### Errors, 7\n")
     assert b"| 8 | 0.25 |" in after["tiny.md"]
     assert after["tiny-errors.png"] != before["tiny-errors.png"]
     assert after["tiny-errors.svg"] != before["tiny-errors.svg"]

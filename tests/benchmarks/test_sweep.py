@@ -259,7 +259,11 @@ def cluster():
     dask = pytest.importorskip("dask")
     distributed = pytest.importorskip("distributed")
     quick_to_give_up = {"distributed.scheduler.allowed-failures": 0}
-    quiet = {"dashboard_address": None, "silence_logs": logging.CRITICAL, "memory_limit": 0}
+    quiet = {
+        "dashboard_address": "127.0.0.1:0",
+        "silence_logs": logging.CRITICAL,
+        "memory_limit": 0,
+    }
     with (
         dask.config.set(quick_to_give_up),
         distributed.LocalCluster(n_workers=2, threads_per_worker=1, **quiet) as cluster,
