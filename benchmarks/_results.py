@@ -56,6 +56,7 @@ def write_csv(path: Path, table: pd.DataFrame) -> None:
 
 
 def plain(value: Any) -> Any:
+    """What JSON can hold: five significant digits, infinities as text, arrays as lists."""
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):

@@ -12,7 +12,7 @@ Config = dict[str, Any]
 #: Models from (s_0, theta) to the reward, without states in between.
 DIRECT = {"GP": DirectRewardGP, "NN": DirectRewardNN}
 # gradient steps of our dynamics networks in quick mode
-QUICK_STEPS = 1500
+QUICK_STEPS = 1000
 # rows of learners whose time grows with the cube of rows (GP) or of features (polynomials)
 MAX_ROWS = {
     "full": {

@@ -57,7 +57,7 @@ def settings(mode: str) -> dict[str, Any]:
 
 
 BENCHMARK = Benchmark(
-    "reward-table", __doc__, run, report, draw, settings, minutes=25, tasks=tuple(TASKS)
+    "reward-table", __doc__, run, report, draw, settings, minutes=20, tasks=tuple(TASKS)
 )
 
 if __name__ == "__main__":

@@ -78,12 +78,12 @@ def test_the_settings_name_what_was_tried():
 
 
 def records(own=np.nan):
-    """Two seeds of some rows: T twice as bad on the second, D lost on one of them."""
+    """Three seeds of some rows: T worse on each, D lost on two of them."""
     lines = []
-    for seed in (0, 1):
+    for seed in (0, 1, 2):
         for kind, row, mean, diverged, far in [
-            ("-", "constant", 0.4, 0, np.nan),
-            ("paper", "T", 0.01 * (1 + seed), 0, 0),
+            ("-", "constant", 0.4 + 0.1 * seed, 0, np.nan),
+            ("paper", "T", 0.01 * (1 + seed**2), 0, 0),
             ("tuned", "T", 0.005, 0, 0),
             ("paper", "GP", 0.03, 0, np.nan),
             ("paper", "D, logged actions", np.inf if seed else 3e5, 7 * seed, 30),
@@ -104,8 +104,8 @@ def test_the_table_is_ordered_and_averages_over_seeds():
         ("-", "constant"),
     ]
     line = frame.iloc[2]
-    assert line["MSE"] == pytest.approx(0.015)
-    assert line["MSE std over seeds"] == pytest.approx(0.01 / np.sqrt(2))
+    assert line["MSE"] == pytest.approx(0.08 / 3)
+    assert line["MSE std over seeds"] == pytest.approx(np.std([0.01, 0.02, 0.05], ddof=1))
     assert line["paper"] == "0.01 ± 0.033"
     assert pd.isna(frame.iloc[3]["paper"])
 
@@ -114,23 +114,23 @@ def test_infinite_is_infinite_and_counted():
     line = table("cartpole", records()).iloc[1]
     assert line["MSE"] == np.inf
     assert np.isnan(line["MSE std over seeds"])
-    assert (line["diverged"], line["lost"], line["episodes"]) == (7, 60, 200)
-    assert "| D, logged actions | 0.057 | 7 of 200 diverge |" in brief("cartpole", records())
+    assert (line["diverged"], line["lost"], line["episodes"]) == (21, 90, 300)
+    assert "| D, logged actions | 0.057 | 21 of 300 diverge |" in brief("cartpole", records())
 
 
 def test_the_short_table_of_cartpole():
     lines = brief("cartpole", records()).splitlines()
     head = "| method | paper prints | its settings, actions aligned | tuned | library defaults |"
     assert lines[0] == head
-    assert "| T | 0.01 | 0.015 ± 0.007 | 0.005 ± 0 |  |" in lines
-    assert lines[-1] == "| constant |  |  |  | 0.4 ± 0 |"
+    assert "| T | 0.01 | 0.027 ± 0.02 | 0.005 ± 0 |  |" in lines
+    assert lines[-1] == "| constant |  |  |  | 0.5 ± 0.1 |"
     assert len(lines) == 6
 
 
 def test_goals_of_their_own_are_compared_with_the_paper():
     lines = brief("reacher", records(own=0.002)).splitlines()
     assert lines[0].startswith("| method | paper prints | its settings, own goals | its settings,")
-    assert "| T | 0.005 | 0.002 | 0.015 ± 0.007 | 0.005 ± 0 |  |" in lines
+    assert "| T | 0.005 | 0.002 | 0.027 ± 0.02 | 0.005 ± 0 |  |" in lines
     assert "| GP | 0.127 |  | 0.03 ± 0 |  |  |" in lines
     assert "MSE, own goals" in report({"reacher": records(own=0.002)})
     assert "own goals" not in report({"cartpole": records()})
@@ -143,8 +143,8 @@ def test_the_figure_shows_every_row_and_what_is_off_the_axis():
     (ax,) = figure.axes
     names = [label.get_text() for label in ax.get_yticklabels()]
     assert names == ["GP", "D, logged actions", "T"]
-    shown = {(line.get_marker(), *map(float, line.get_xdata())) for line in ax.get_lines()}
-    assert {("s", 0.03), ("s", 0.015), ("o", 0.005), (">", 10.0)} <= shown
-    assert [text.get_text() for text in ax.texts] == ["7 of 200 diverge"]
+    shown = {(line.get_marker(), *np.round(line.get_xdata(), 6)) for line in ax.get_lines()}
+    assert {("s", 0.03), ("s", 0.026667), ("o", 0.005), (">", 10.0)} <= shown
+    assert [text.get_text() for text in ax.texts] == ["21 of 300 diverge"]
     assert "paper's settings" in figure.legends[0].get_texts()[0].get_text()
     plt.close(figure)
