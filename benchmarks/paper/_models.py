@@ -28,7 +28,7 @@ QUICK_EPOCHS = {"T": 1, "one-step": 2, "LSTM": 1}
 # decoupled weight decay of a network that sees what the controller computes
 FEATURES_WEIGHT_DECAY = 0.1
 # sub-trajectories that a Gaussian process can take
-GP_ROWS = 1500
+GP_ROWS = 1000
 
 #: How a model is written in tables and legends.
 LABELS = {"paper": "", "default": " (ours)"}

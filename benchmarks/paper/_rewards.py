@@ -2,6 +2,7 @@
 
 import time
 import warnings
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,6 +30,12 @@ class Predicted(NamedTuple):
     rewards: Floats
     own: Floats | None = None
     far: int | None = None
+
+
+@lru_cache(maxsize=3)
+def flown(task: str, seed: int) -> tuple[TrajectoryDataset, TrajectoryDataset]:
+    """Training and test episodes, simulated once for all cells of a process."""
+    return episodes(task, seed)
 
 
 def rows(model: str) -> dict[str, str | None]:
@@ -85,7 +92,7 @@ def constant(train: TrajectoryDataset, n: int, reward: Any, goals: Floats | None
 def cell(task: str, model: str, settings: str, mode: str, seed: int) -> list[dict[str, Any]]:
     """Fit one model on one seed; one record a row of the table."""
     reward = environment(task).reward
-    train, test = episodes(task, seed)
+    train, test = flown(task, seed)
     goals = own_goals(len(test), seed) if task == "reacher" else None
     states = states_of(test)
     truth = Predicted(

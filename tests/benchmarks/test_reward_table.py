@@ -22,7 +22,7 @@ def few(task, seed):
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr(_rewards, "episodes", few)
+    monkeypatch.setattr(_rewards, "flown", few)
     monkeypatch.setattr(_reward_models, "QUICK_STEPS", 10)
     monkeypatch.setattr(_models, "QUICK_EPOCHS", {"T": 1, "one-step": 1})
     tiny = dict.fromkeys(_reward_models.MAX_ROWS["quick"], 12)

@@ -21,7 +21,7 @@ def few(task, seed):
 
 @pytest.fixture
 def small(monkeypatch):
-    monkeypatch.setattr(_rewards, "episodes", few)
+    monkeypatch.setattr(_rewards, "flown", few)
     monkeypatch.setattr(_reward_models, "QUICK_STEPS", 10)
 
 
