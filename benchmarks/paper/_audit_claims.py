@@ -158,12 +158,12 @@ def ensembles(sources: Sources) -> Claim:
                 {"model": worse, "actions": actions},
                 {"model": better, "actions": actions},
                 "long",
-                condition=f"{task}, {by}",
-                what=f"{worse} / {better}",
+                condition=f"{better} better than {worse}",
+                what=f"{worse} / {better}, {task}, {by}",
             )
+            for better, worse in (("PE", "P"), ("P", "DE"), ("DE", "D"))
             for task in TASKS
             for actions, by in ACTIONS.items()
-            for better, worse in (("PE", "P"), ("P", "DE"), ("DE", "D"))
         ],
         figure="all-models/all-models.png",
     )
@@ -171,22 +171,22 @@ def ensembles(sources: Sources) -> Claim:
 
 def trajectory_ensembles(sources: Sources) -> Claim:
     episodes = sources["all-models"]["episodes"]
-    pairs = (("TE", "T", False), ("TPE", "TP", False), ("TP", "T", True))
+    pairs = (("TE", "T", False), ("TPE", "TP", False), ("T", "TP", True))
     return Claim(
         "Trajectory models: ensembles help, probabilistic training does not",
         "TE is better than T and TPE than TP; TP is about as accurate as T.",
         [
             compare(
                 episodes[episodes["task"] == task],
-                {"model": a if same else b},
-                {"model": b if same else a},
+                {"model": other},
+                {"model": better},
                 "long",
-                condition=task,
-                what=f"{a} / {b}" if same else f"{b} / {a}",
+                condition=f"{other} like {better}" if same else f"{better} better than {other}",
+                what=f"{other} / {better}, {task}",
                 same=same,
             )
+            for better, other, same in pairs
             for task in TASKS
-            for a, b, same in pairs
         ],
     )
 
@@ -328,7 +328,7 @@ def _of_models(
 
 def planning(sources: Sources) -> Claim:
     seconds = sources["audit"]["planning"]
-    by_way = seconds.set_index(["way", "candidates", "seed"])["seconds"]
+    by_way = seconds.set_index(["way", "candidates", "seed"])["seconds"].sort_index()
     return Claim(
         "Planning is cheaper with one evaluation than with a roll-out",
         "Evaluating all horizons at once spares the sequential steps of a roll-out and can "
@@ -337,7 +337,7 @@ def planning(sources: Sources) -> Claim:
             compare_seeds(
                 by_way.loc["one-step", n].to_numpy(),
                 by_way.loc[way, n].to_numpy(),
-                condition=f"{n} candidates, {way.partition(', ')[2] or 'every horizon'}",
+                condition=f"candidates: {n}, {way.partition(', ')[2] or 'every horizon'}",
                 what="seconds of one-step / seconds of T",
             )
             for n in seconds["candidates"].unique()

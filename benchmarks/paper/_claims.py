@@ -86,12 +86,23 @@ class Claim:
             met[one.condition] = met.get(one.condition, True) and one.verdict == verdict
         return [condition for condition, all_of_it in met.items() if all_of_it]
 
-    def effect(self) -> str:
-        """Least and greatest ratio over all comparisons."""
-        ratios = [one.estimate for one in self.comparisons]
+    def mixed(self) -> list[str]:
+        """Conditions that speak neither for the claim nor against it throughout."""
+        clear = {*self.conditions("for"), *self.conditions("against")}
+        return [
+            name
+            for name in dict.fromkeys(one.condition for one in self.comparisons)
+            if name not in clear
+        ]
+
+    def effect(self, verdict: str) -> str:
+        """How many comparisons have a verdict, with their least and greatest ratio."""
+        ratios = [one.estimate for one in self.comparisons if one.verdict == verdict]
         if not ratios:
-            return ""
-        return f"{number(min(ratios))} to {number(max(ratios))}"
+            return "0"
+        if len(ratios) == 1:
+            return f"1 ({number(ratios[0])})"
+        return f"{len(ratios)} ({number(min(ratios))} to {number(max(ratios))})"
 
 
 def to_tables(claims: Sequence[Claim]) -> dict[str, pd.DataFrame]:

@@ -50,7 +50,14 @@ def test_a_claim_holds_where_all_its_comparisons_do():
     # a condition counts only if everything measured under it agrees
     assert Claim("c", "s", [good, unsure, bad]).conditions("for") == []
     assert Claim("c", "s", []).verdict == "not measured"
-    assert mixed.effect() == "0.5 to 2"
+    assert mixed.mixed() == []
+    assert Claim("c", "s", [good, unsure, bad]).mixed() == ["here"]
+    assert [mixed.effect(verdict) for verdict in ("for", "against", "open")] == [
+        "1 (2)",
+        "1 (0.5)",
+        "0",
+    ]
+    assert Claim("c", "s", [good, ratio(4, 3, 5)]).effect("for") == "2 (2 to 4)"
 
 
 def table(factor=1.0):
