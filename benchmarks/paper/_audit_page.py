@@ -23,7 +23,8 @@ trajectory models). In both, actions are aligned: a_t takes s_t to s_t+1. A rati
 for the claim. The interval behind it holds the middle 95 % of a bootstrap over test episodes; the
 range is over training seeds. A comparison counts for or against a claim only if the interval and
 every seed agree, otherwise it is open. *Holds* means that all comparisons speak for the claim,
-*fails* that none does, *holds only if* that some do, under the conditions named.
+*holds only if* that there are conditions under which all do (they are named), *fails* that there
+are none.
 """
 
 
@@ -54,7 +55,7 @@ def _overview(claims: Sequence[Claim]) -> pd.DataFrame:
 
 def _section(i: int, claim: Claim) -> list[str]:
     lines = [f"### {i}. {claim.title}", "", f"*The paper:* {claim.says}", ""]
-    lines += [f"*Verdict:* **{claim.verdict}**{_conditions(claim)}", ""]
+    lines += [f"*Verdict:* **{claim.verdict}**", "", *_conditions(claim)]
     lines += [*(f"{note}\n" for note in claim.notes)]
     if claim.figure:
         lines += [f"![{claim.title}](../benchmarks/paper/results/{claim.figure})", ""]
@@ -62,18 +63,16 @@ def _section(i: int, claim: Claim) -> list[str]:
     return [*lines, markdown(_comparisons(claim)), "", "</details>", ""]
 
 
-def _conditions(claim: Claim) -> str:
-    """Under which conditions it holds, and under which the opposite is true."""
+def _conditions(claim: Claim) -> list[str]:
+    """Under which conditions it holds, under which the opposite is true, and the rest."""
     if claim.verdict in ("holds", "not measured"):
-        return "."
-    said = []
-    if held := claim.conditions("for"):
-        said.append("It holds for: " + "; ".join(held) + ".")
-    if opposite := claim.conditions("against"):
-        said.append("The opposite holds for: " + "; ".join(opposite) + ".")
-    if mixed := claim.mixed():
-        said.append("Mixed or open: " + "; ".join(mixed) + ".")
-    return ". " + " ".join(said)
+        return []
+    lines = {
+        "It holds for": claim.conditions("for"),
+        "The opposite holds for": claim.conditions("against"),
+        "Mixed or open": claim.mixed(),
+    }
+    return [*(f"- {said}: {'; '.join(names)}." for said, names in lines.items() if names), ""]
 
 
 def _comparisons(claim: Claim) -> pd.DataFrame:

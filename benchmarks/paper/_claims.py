@@ -77,7 +77,7 @@ class Claim:
             return "not measured"
         if each == {"for"}:
             return "holds"
-        return "holds only if" if "for" in each else "fails"
+        return "holds only if" if self.conditions("for") else "fails"
 
     def conditions(self, verdict: str) -> list[str]:
         """Conditions under which all comparisons have a verdict, in order."""

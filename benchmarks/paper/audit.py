@@ -141,7 +141,7 @@ def draw(tables: Tables) -> dict[str, Any]:
     import matplotlib.pyplot as plt
 
     judged = from_tables(tables)
-    figure, ax = plt.subplots(figsize=(8.0, 0.9 + 0.42 * len(judged)), layout="constrained")
+    figure, ax = plt.subplots(figsize=(11.0, 0.9 + 0.42 * len(judged)), layout="constrained")
     looks = {"for": ("o", "#0072B2"), "against": ("X", "#D55E00"), "open": ("s", GREY)}
     for row, claim in enumerate(judged):
         for verdict, (marker, colour) in looks.items():

@@ -49,6 +49,7 @@ def test_a_claim_holds_where_all_its_comparisons_do():
     assert mixed.conditions("against") == ["there"]
     # a condition counts only if everything measured under it agrees
     assert Claim("c", "s", [good, unsure, bad]).conditions("for") == []
+    assert Claim("c", "s", [good, unsure, bad]).verdict == "fails"
     assert Claim("c", "s", []).verdict == "not measured"
     assert mixed.mixed() == []
     assert Claim("c", "s", [good, unsure, bad]).mixed() == ["here"]
