@@ -28,10 +28,13 @@ are none.
 """
 
 
+_PICTURE = "![Every comparison at a glance](../benchmarks/paper/results/audit/audit.png)"
+
+
 def page(tables: Tables) -> str:
     """The page as Markdown, from the tables of the audit alone."""
     claims = from_tables(tables)
-    parts = [_HEAD, "## Verdicts", "", markdown(_overview(claims)), ""]
+    parts = [_HEAD, "## Verdicts", "", markdown(_overview(claims)), "", _PICTURE, ""]
     parts += ["## Claim by claim", ""]
     for i, claim in enumerate(claims, 1):
         parts += _section(i, claim)
