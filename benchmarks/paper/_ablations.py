@@ -28,7 +28,9 @@ from trajlearn.exceptions import DivergenceWarning
 
 #: Share of the training episodes that the paper's GP is fitted to before it is scored on all.
 GP_SHARE = 0.8
-#: Gradient steps at which the direct network is looked at.
+#: Learning rate of the direct network in the paper's code.
+NN_RATE = 3e-5
+#: Gradient steps at which it is looked at; the paper's code takes about as many as the first.
 NN_STEPS = {"full": (30, 100, 1000, 10_000), "quick": (30, 300)}
 
 
@@ -80,8 +82,10 @@ def reward_cell(task: str, method: str, mode: str, seed: int) -> dict[str, Any]:
 
 def _reward_model(task: str, method: str, mode: str, seed: int) -> Any:
     env = environment(task)
-    if method in ("GP", "NN"):
-        return paper.model(method, reward=env.reward, random_state=seed)
+    if method == "GP":
+        return paper.model("GP", reward=env.reward, random_state=seed)
+    if method == "NN":
+        return _hardly_trained(min(NN_STEPS[mode]), env.reward, seed)
     policy = dataclasses.replace(env.policy, p_scale=1.0) if "weak" in method else env.policy
     return build(method[0], "paper", policy=policy, mode=mode, seed=seed)
 
@@ -109,14 +113,16 @@ def late_cell(task: str, settings: str, mode: str, seed: int) -> dict[str, Any]:
 
 
 def budget_cell(
-    task: str, model: str, n_train: int, budget: str, mode: str, seed: int
+    task: str, model: str, n_train: int, steps: int, budget: str, mode: str, seed: int
 ) -> dict[str, Any]:
-    """D or T on some training episodes; D also with T's learning rate, batch and steps.
+    """D or T on training episodes of some steps; D also with T's learning rate and steps.
 
     `budget` is "own" (the paper's settings of the model) or "of T".
     """
     env, length = environment(task), TASKS[task].length
-    train, test = episodes(task, seed, n_test=N_TEST[mode])
+    _, test = episodes(task, seed, n_test=N_TEST[mode])
+    # an episode begins the same whatever its length: the first n of the usual ones
+    train = env.collect(n_train, steps, random_state=2 * seed)
     estimator = build(model, "paper", policy=env.policy, mode=mode, seed=seed)
     if budget == "of T":
         pattern = paper.model("T").get_params()
@@ -128,7 +134,7 @@ def budget_cell(
             estimator__max_epochs=None,
             estimator__max_steps=epochs * pattern["relabeler__max_rows"] // batch,
         )
-    estimator.fit(train[:n_train])
+    estimator.fit(train)
     sources = ["none"] if model == "T" else ["logged", "policy"]
     return {
         actions: assess(
@@ -143,8 +149,7 @@ def untrained_cell(task: str, steps: int, mode: str, seed: int) -> dict[str, Any
     env = environment(task)
     train, test = episodes(task, seed, n_test=N_TEST[mode])
     if steps:
-        model = paper.model("NN", reward=env.reward, random_state=seed)
-        model.set_params(estimator__max_epochs=None, estimator__max_steps=steps)
+        model = _hardly_trained(steps, env.reward, seed)
     else:
         model = DirectRewardNN(reward=env.reward, random_state=seed)
     model.fit(train)
@@ -154,12 +159,22 @@ def untrained_cell(task: str, steps: int, mode: str, seed: int) -> dict[str, Any
     }
 
 
+def _hardly_trained(steps: int, reward: Any, seed: int) -> Any:
+    """The direct network at the learning rate of the paper's code."""
+    model = paper.model("NN", reward=reward, random_state=seed)
+    return model.set_params(
+        estimator__learning_rate=NN_RATE,
+        estimator__max_epochs=None,
+        estimator__max_steps=steps,
+    )
+
+
 def planning_cell(candidates: int, mode: str, seed: int) -> dict[str, float]:
     """Seconds for whole trajectories of many candidates, by bare networks of the paper's size.
 
-    Nothing of this library is timed: plain torch, one thread, the best of what each formulation
-    allows; 200 steps of cartpole, T in cache-sized pieces, T at every tenth horizon, and a
-    one-step model rolled out with the linear controller. Rounds alternate; median seconds.
+    Nothing of this library is timed: plain torch on one thread, 200 steps of cartpole. T at all
+    horizons and at every tenth, in cache-sized pieces; a one-step model rolled out with the linear
+    controller. Rounds alternate; median seconds.
     """
     import torch
 
@@ -175,9 +190,9 @@ def planning_cell(candidates: int, mode: str, seed: int) -> dict[str, float]:
     jump, step = network(d_s + 1 + p), network(d_s + 1)
     states = torch.rand(candidates, d_s, generator=generator)
     gains = torch.rand(candidates, p, generator=generator)
-    piece = 10  # candidates at once whose rows fit a cache
 
     def trajectories(horizons: torch.Tensor) -> None:
+        piece = 2000 // len(horizons)  # candidates at once whose rows fit a cache
         for at in range(0, candidates, piece):
             some, theta = states[at : at + piece], gains[at : at + piece]
             n = len(some)
@@ -220,8 +235,10 @@ def plan(mode: str, seeds: list[int]) -> dict[Callable[..., Any], list[dict[str,
     base = [{"mode": mode, "seed": seed} for seed in seeds]
     methods = {"cartpole": ["GP", "NN", "D", "D late", "T"]}
     methods["reacher"] = [*methods["cartpole"], "D weak", "D late weak"]
-    budgets = [("D", 50, "own"), ("D", N_EPISODES, "own"), ("D", N_EPISODES, "of T")]
-    budgets += [("T", 50, "own"), ("T", N_EPISODES, "own")]
+    # the paper's code: the same number of transitions, in half the episodes
+    usual, long = TASKS["reacher"]
+    budgets = [("D", N_EPISODES // 2, long, "own"), ("D", N_EPISODES, usual, "own")]
+    budgets += [("D", N_EPISODES, usual, "of T"), ("T", N_EPISODES, usual, "own")]
     return {
         reward_cell: [
             {"task": task, "method": method} | b
@@ -236,9 +253,9 @@ def plan(mode: str, seeds: list[int]) -> dict[Callable[..., Any], list[dict[str,
             for kind in ("paper", "default")
         ],
         budget_cell: [
-            {"task": "reacher", "model": model, "n_train": n, "budget": budget} | b
+            {"task": "reacher", "model": model, "n_train": n, "steps": steps, "budget": budget} | b
             for b in base
-            for model, n, budget in budgets
+            for model, n, steps, budget in budgets
         ],
         untrained_cell: [
             {"task": task, "steps": steps} | b

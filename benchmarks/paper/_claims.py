@@ -46,8 +46,9 @@ class Comparison:
 
         The interval tells of the test episodes, the seeds of training: both must agree.
         """
-        ends = [value for value in (self.low, self.high, *self.seeds) if not np.isnan(value)]
-        if not ends:
+        interval = [value for value in (self.low, self.high) if not np.isnan(value)]
+        ends = [*interval, *self.seeds]
+        if not ends or np.isnan(ends).any():  # one infinite error over another tells nothing
             return "open"
         least, most = min(ends), max(ends)
         if self.same:
@@ -71,13 +72,15 @@ class Claim:
 
     @property
     def verdict(self) -> str:
-        """ "holds", "holds only if" or "fails"; "not measured" without comparisons."""
+        """ "holds", "holds only if", "fails" or "open"; "not measured" without comparisons."""
         each = {comparison.verdict for comparison in self.comparisons}
         if not each:
             return "not measured"
         if each == {"for"}:
             return "holds"
-        return "holds only if" if self.conditions("for") else "fails"
+        if self.conditions("for"):
+            return "holds only if"
+        return "fails" if "against" in each else "open"
 
     def conditions(self, verdict: str) -> list[str]:
         """Conditions under which all comparisons have a verdict, in order."""

@@ -95,7 +95,7 @@ def test_a_budget_of_t_is_the_steps_rate_and_batch_of_t(small, monkeypatch):
 
     monkeypatch.setattr(_ablations, "build", unfitted)
     monkeypatch.setattr(_ablations, "assess", lambda *args, **kwargs: {"windows": {}})
-    _ablations.budget_cell("reacher", "D", 4, "of T", "full", 0)
+    _ablations.budget_cell("reacher", "D", 4, 60, "of T", "full", 0)
     learner = fitted["model"].get_params()
     assert learner["estimator__learning_rate"] == 8e-4
     assert learner["estimator__batch_size"] == 64

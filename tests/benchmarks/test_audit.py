@@ -71,7 +71,7 @@ def test_the_reward_table_takes_the_defects_away_one_by_one():
         )
     ]
     table = _audit_page.reward_table(pd.DataFrame(lines)).set_index(["task", "method"])
-    columns = ["its protocol", "proper difference", "right gains", "fresh episodes"]
+    columns = ["with its defects", "proper difference", "right gains", "fresh episodes"]
     columns.append("actions aligned")
 
     def numbers(method):
@@ -79,7 +79,7 @@ def test_the_reward_table_takes_the_defects_away_one_by_one():
         return [float(entry.split()[0]) if entry else None for entry in entries]
 
     assert numbers("GP") == [10, 1, None, 2, None]
-    assert numbers("D, recomputed") == [3, None, 4, 5, 6]
+    assert numbers("D, recomputed actions") == [3, None, 4, 5, 6]
 
 
 def test_rewards_and_medians_of_cells_become_lines():

@@ -29,6 +29,7 @@ def ratio(estimate, low, high, seeds=(), condition="here", same=False):
         (ratio(np.inf, 5, np.inf, [3, np.inf]), "for"),
         (ratio(2, np.nan, np.nan, [1.5, 3]), "for"),  # known by seed only
         (ratio(np.nan, np.nan, np.nan, [np.nan]), "open"),
+        (ratio(2, 1.5, 3, [2, np.nan, 2]), "open"),
         (ratio(1.1, 0.9, 1.2, [1, 1.3], same=True), "for"),
         (ratio(1.1, 0.9, 1.6, [1, 1.3], same=True), "open"),
         (ratio(3, 2, 4, [2.5, 3.5], same=True), "against"),
@@ -50,6 +51,7 @@ def test_a_claim_holds_where_all_its_comparisons_do():
     # a condition counts only if everything measured under it agrees
     assert Claim("c", "s", [good, unsure, bad]).conditions("for") == []
     assert Claim("c", "s", [good, unsure, bad]).verdict == "fails"
+    assert Claim("c", "s", [unsure]).verdict == "open"
     assert Claim("c", "s", []).verdict == "not measured"
     assert mixed.mixed() == []
     assert Claim("c", "s", [good, unsure, bad]).mixed() == ["here"]
