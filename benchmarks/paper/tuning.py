@@ -42,8 +42,7 @@ PLANS = {
         Plan("cartpole", "D", 12),
         Plan("cartpole", "T", 2),
         Plan("cartpole", "LSTM", 4),
-        Plan("reacher", "T", 2, _NETWORK),
-        Plan("reacher", "D", 6, ("learning rate",)),
+        Plan("reacher", "T", 2, ("learning rate",)),
     ],
     "quick": [
         Plan("cartpole", "D", 2),
