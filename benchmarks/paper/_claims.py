@@ -8,8 +8,16 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
+from benchmarks.paper._command import Tables
 from benchmarks.paper._intervals import by_seed, ratio, ratio_of_each_seed
 
+#: Tables by benchmark.
+Sources = dict[str, Tables]
+
+#: Where a roll-out takes its actions from, as a condition reads.
+ACTIONS = {"logged": "logged actions", "policy": "recomputed actions"}
+#: Settings as a condition reads, and how they mark the name of a model.
+SETTINGS = {"paper's settings": "", "tuned (our defaults)": " (ours)"}
 #: How far apart two errors may be that are called the same.
 SAME = 1.5
 

@@ -26,7 +26,7 @@ from benchmarks.paper._ablations import (
 )
 from benchmarks.paper._audit_claims import claims
 from benchmarks.paper._audit_page import page
-from benchmarks.paper._claims import from_tables, to_tables
+from benchmarks.paper._claims import Sources, from_tables, to_tables
 from benchmarks.paper._command import Benchmark, Run, Tables, read_tables
 from benchmarks.paper._rollouts import N_TEST
 from benchmarks.paper._tasks import N_EPISODES, TASKS
@@ -63,13 +63,19 @@ def run(run: Run) -> Tables:
             for way, taken in result.items()
         ),
     }
-    stored: dict[str, Tables] = {}
-    for benchmark, result in _results():
-        stored.setdefault(benchmark, {}).update(read_tables(run.root / benchmark, result))
-    aligned = _aligned(stored["horizon-error"]["episodes"])
+    sources = stored(run.root)
+    aligned = _aligned(sources["horizon-error"]["episodes"])
     ablations["late"] = pd.concat([ablations["late"], aligned], ignore_index=True)
-    judged = claims(stored | {"audit": ablations})
+    judged = claims(sources | {"audit": ablations})
     return to_tables(judged) | ablations | {"sources": _provenance(run)}
+
+
+def stored(root: Path) -> Sources:
+    """Tables of the other benchmarks in a folder of results."""
+    sources: Sources = {}
+    for benchmark, result in _results():
+        sources.setdefault(benchmark, {}).update(read_tables(root / benchmark, result))
+    return sources
 
 
 def _aligned(episodes: pd.DataFrame) -> pd.DataFrame:

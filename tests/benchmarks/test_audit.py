@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from benchmarks._results import write_csv
 from benchmarks.paper import _audit_page, audit
 from benchmarks.paper._claims import Claim, Comparison, from_tables, to_tables
 from benchmarks.paper._command import RESULTS, read_tables
@@ -30,6 +31,63 @@ def test_it_rests_on_full_runs_of_three_seeds(stored):
     assert set(sources["mode"]) == {"full"}
     assert sources["seeds"].min() >= 3
     assert all(stored[name]["seed"].nunique() >= 3 for name in ("rewards", "late", "planning"))
+
+
+@pytest.fixture(scope="module")
+def sources():
+    return audit.stored(RESULTS)
+
+
+def test_the_committed_results_still_lead_to_these_comparisons(stored, sources, tmp_path):
+    judged = to_tables(audit.claims(sources | {"audit": stored}))
+    for name, table in judged.items():
+        write_csv(tmp_path / f"{name}.csv", table)
+        assert (tmp_path / f"{name}.csv").read_bytes() == (STORED / f"{name}.csv").read_bytes()
+
+
+def test_a_comparison_is_that_of_the_raw_lines(stored, sources):
+    def medians(table, column, **chosen):
+        for name, value in chosen.items():
+            table = table[table[name] == value]
+        return [np.median(some[column]) for _, some in table.groupby("seed")]
+
+    def found(claim, condition, what):
+        [one] = [
+            one
+            for some in from_tables(stored)
+            for one in some.comparisons
+            if (some.title, one.condition, one.what) == (claim, condition, what)
+        ]
+        return one
+
+    episodes = sources["horizon-error"]["episodes"]
+    episodes = episodes[episodes["task"] == "reacher"]
+    d, t = (medians(episodes, "long", model=name, actions=how)
+            for name, how in (("D", "logged"), ("T", "none")))  # fmt: skip
+    one = found(
+        "Trajectory models are more accurate far ahead",
+        "reacher, paper's settings, logged actions",
+        "D / T",
+    )
+    assert one.estimate == pytest.approx(np.median(d) / np.median(t), rel=1e-3)
+    assert one.seeds == pytest.approx(np.divide(d, t), rel=1e-3)
+    # for the claim that T is worse at first, the same the other way round
+    d, t = (medians(episodes, "short", model=name, actions=how)
+            for name, how in (("D", "logged"), ("T", "none")))  # fmt: skip
+    one = found(
+        "Trajectory models are less accurate at short horizons",
+        "reacher, paper's settings, logged actions",
+        "T / D",
+    )
+    assert one.estimate == pytest.approx(np.median(t) / np.median(d), rel=1e-3)
+    rewards = sources["reward-table"]["cartpole"]
+    gp, t = (medians(rewards, "mean", settings="tuned", row=row) for row in ("GP", "T"))
+    one = found(
+        "Trajectory models predict the reward of an episode best",
+        "cartpole, tuned on training episodes, against GP",
+        "mean squared error of the reward, over that of T",
+    )
+    assert one.seeds == pytest.approx(np.divide(gp, t), rel=1e-3)
 
 
 def test_the_pictures_of_the_page_are_there():
