@@ -241,7 +241,7 @@ def test_parameters_of_the_wrong_kind_are_refused(Model, wrong, ds):
     ("model", "name"),
     [
         (TrajectoryRegressor(gate=-1.0), "gate"),
-        (TrajectoryRegressor(baseline="mean"), "baseline"),
+        (TrajectoryRegressor(baseline="median"), "baseline"),
         (TrajectoryRegressor(error_score=2.0), "error_score"),
         (TrajectoryRegressor(fresh_batches="yes"), "fresh_batches"),
         (OneStepRegressor(target="next"), "target"),

@@ -66,10 +66,10 @@ def test_blocks_of_sub_trajectories_come_in_order():
     assert list(relabeler.get_feature_names_out()) == [
         "s0", "s1", "horizon", "theta0", "theta1",
         "task=pull", "task=push", "motors=4", "motors=6", "motors=8",
-        "ref0", "ref0+h", "phase",
+        "ref0", "ref0+h", "phase", "phase+h",
     ]  # fmt: skip
     assert relabeler.layout_["context"] == slice(5, 10)
-    assert rows.shape == ((ds.lengths * (ds.lengths + 1) // 2).sum(), 13)
+    assert rows.shape == ((ds.lengths * (ds.lengths + 1) // 2).sum(), 14)
     begin, end = rows[:, 0], targets[:, 0]
     episode = (begin // 100).astype(int) - 1
     np.testing.assert_array_equal(episode, relabeler.sample_indices_)
@@ -334,7 +334,7 @@ def test_a_stream_brings_fresh_batches():
     relabeler = SubtrajectoryRelabeler(random_state=0, starts="early", horizons="mixture")
     first, second = itertools.islice(relabeler.stream(ds, 16), 2)
     rows, targets, episode = first
-    assert rows.shape == (16, 13)
+    assert rows.shape == (16, 14)
     np.testing.assert_array_equal(rows[:, 0] // 100 - 1, episode)
     np.testing.assert_array_equal(targets[:, 0] // 100 - 1, episode)
     assert not np.array_equal(first[0], second[0])

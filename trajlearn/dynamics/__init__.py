@@ -1,19 +1,31 @@
 """Formulations of dynamics: relabel, scale, learn, forecast."""
 
+from trajlearn.dynamics.baselines import (
+    CurveForecaster,
+    HoldForecaster,
+    MeanEpisodeForecaster,
+    ReferenceForecaster,
+)
 from trajlearn.dynamics.direct_reward import DirectRewardGP, DirectRewardNN
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.dynamics.lstm import LSTMRegressor
 from trajlearn.dynamics.one_step import OneStepRegressor
+from trajlearn.dynamics.phase import PhaseFeatures
 from trajlearn.dynamics.scaling import BlockScaler, HorizonFeatures
 from trajlearn.dynamics.trajectory import TrajectoryRegressor
 
 __all__ = [
     "BlockScaler",
+    "CurveForecaster",
     "DirectRewardGP",
     "DirectRewardNN",
     "Forecast",
+    "HoldForecaster",
     "HorizonFeatures",
     "LSTMRegressor",
+    "MeanEpisodeForecaster",
     "OneStepRegressor",
+    "PhaseFeatures",
+    "ReferenceForecaster",
     "TrajectoryRegressor",
 ]

@@ -1,8 +1,8 @@
-"""Forecasting from episodes: what every dynamics estimator offers on top of rows."""
+"""What every formulation offers: rows or episodes, a baseline, forecasts for planning."""
 
-import warnings
 from abc import abstractmethod
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,44 +10,70 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from trajlearn.dynamics._base import TwoDoorRegressor
-from trajlearn.dynamics._query import Query, make_query, planned
+from trajlearn.dynamics._forecaster import Forecaster, Prediction
+from trajlearn.dynamics._planned import broadcast, by_episode, planned
+from trajlearn.dynamics._query import Query
+from trajlearn.dynamics._relative import BASE, ahead, curve, fit_baseline, relative_to
 from trajlearn.dynamics.forecast import Forecast
-from trajlearn.exceptions import DivergenceWarning, HorizonWarning
-from trajlearn.trajectories import TrajectoryDataset, as_dataset, is_episodes
-from trajlearn.trajectories.rewards import Reward, step_rewards
+from trajlearn.trajectories import TrajectoryDataset, is_episodes
 
-__all__ = ["DynamicsEstimator", "Prediction"]
+__all__ = ["DynamicsEstimator"]
 
 Floats = NDArray[np.float64]
 
-# a forecast further than this from the training states, in their ranges, counts as diverged
-DIVERGENCE_RANGES = 1e6
 
-
-@dataclass
-class Prediction:
-    """What a formulation computes for a `Query`: arrays (n, H, d_s), samples one axis more."""
-
-    mean: Floats
-    std: Floats | None = None
-    samples: Floats | None = None
-    actions: str = "none"
-
-
-class DynamicsEstimator(TwoDoorRegressor):
+class DynamicsEstimator(Forecaster, TwoDoorRegressor):
     """Estimator of future states from logged episodes."""
 
-    error_score: float
+    baseline: Any
+    baseline_: Any
 
     # -- what a formulation defines -------------------------------------------------------
 
     @abstractmethod
-    def _reads_logged_future(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
-        """Whether a forecast needs logged signals after the start."""
-
-    _needs_constant_params = False
+    def _fit_states(
+        self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
+    ) -> None:
+        """Fit on episodes whose states are relative to the baseline, if there is one."""
 
     @abstractmethod
+    def _forecast_states(
+        self,
+        query: Query,
+        *,
+        actions: str,
+        policy: Any,
+        return_std: bool,
+        n_samples: int | None,
+        rng: np.random.Generator,
+    ) -> Prediction:
+        """Predict the states of a query, relative to the baseline."""
+
+    # -- fitting --------------------------------------------------------------------------
+
+    def _fit_door_of_rows(self, X: Any, y: Any, sample_weight: Any, groups: Any) -> None:
+        if not (
+            self.baseline is None or (isinstance(self.baseline, str) and self.baseline == "state")
+        ):
+            raise ValueError(
+                f"baseline={self.baseline!r} needs episodes: rows say neither which episode they "
+                "are from nor when. Fit on episodes, or leave baseline= out."
+            )
+        self.baseline_ = None
+        super()._fit_door_of_rows(X, y, sample_weight, groups)
+
+    def _fit_episodes(
+        self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
+    ) -> None:
+        # a model of one step knows no longest horizon; the others set it
+        self._learn_ranges(ds.states, ds.state_names, np.inf)
+        self.baseline_, states = fit_baseline(self.baseline, ds, weight, groups, self._rng)
+        if states is not None:
+            ds = relative_to(self.baseline_, ds, states)
+        self._fit_states(ds, weight, groups)
+
+    # -- prediction -----------------------------------------------------------------------
+
     def _forecast(
         self,
         query: Query,
@@ -58,77 +84,17 @@ class DynamicsEstimator(TwoDoorRegressor):
         n_samples: int | None,
         rng: np.random.Generator,
     ) -> Prediction:
-        """Predict the states of a query."""
-
-    # -- fitting --------------------------------------------------------------------------
-
-    def _learn_ranges(self, states: Floats, names: tuple[str, ...], longest: float) -> None:
-        self.state_range_ = np.stack([states.min(axis=0), states.max(axis=0)])
-        self.state_names_ = names
-        self.max_horizon_ = longest
-
-    # -- prediction -----------------------------------------------------------------------
-
-    def forecast(
-        self,
-        X: Any,
-        *,
-        start: ArrayLike = 0,
-        horizon: int | None = None,
-        actions: str = "auto",
-        policy: Any = None,
-        return_std: bool = False,
-        n_samples: int | None = None,
-        random_state: Any = None,
-    ) -> Forecast:
-        """Predict the states after a start.
-
-        History is ``states[:start + 1]`` and ``actions[:start]``. Nothing later is read except
-        times, references, theta and, only with ``actions="logged"``, actions.
-
-        Parameters
-        ----------
-        X : TrajectoryDataset or list of Trajectory
-        start : int, array-like of shape (n,) or (n, k), default=0
-            Index of the state to begin at: one, one per episode, or several per episode.
-        horizon : int or None, default=None
-            Steps to predict; None goes to the end of each episode. With known times ahead a
-            forecast may go past the log, unless it needs logged signals there.
-        actions : {"auto", "logged", "policy"}, default="auto"
-            Where a roll-out takes its actions from; models without actions ignore it.
-        policy : callable, optional
-            ``policy(states (n, d_s), params (n, p), times (n,)) -> actions (n, d_a)``.
-        return_std : bool, default=False
-            Also predict the total predictive standard deviation.
-        n_samples : int or None, default=None
-            Also draw that many whole trajectories.
-        random_state : int, RandomState or None, default=None
-
-        Returns
-        -------
-        Forecast
-
-        Warns
-        -----
-        HorizonWarning
-            If a horizon is longer than any in training.
-        DivergenceWarning
-            If a forecast becomes non-finite or leaves 1e6 training ranges.
-        """
-        check_is_fitted(self, "estimator_")
-        ds = self._checked(as_dataset(X))
-        if actions not in ("auto", "logged", "policy"):
-            raise ValueError(f'actions = {actions!r}; choose "auto", "logged" or "policy".')
-        query, episode = make_query(
-            ds,
-            start,
-            horizon,
-            within_log=self._reads_logged_future(ds, actions, policy),
-            within_stretch=self._needs_constant_params,
-        )
-        self._warn_beyond_training(query)
-        rng = np.random.default_rng(random_state if random_state is None else _seed(random_state))
-        prediction = self._forecast(
+        base = None
+        if self.baseline_ is not None:
+            states = curve(self.baseline_, query.ds)
+            base = ahead(self.baseline_, query)
+            start = states[query.rows][:, None]
+            query = replace(
+                query,
+                ds=relative_to(self.baseline_, query.ds, states),
+                base=np.concatenate([start, base], axis=1),
+            )
+        prediction = self._forecast_states(
             query,
             actions=actions,
             policy=policy,
@@ -136,7 +102,11 @@ class DynamicsEstimator(TwoDoorRegressor):
             n_samples=n_samples,
             rng=rng,
         )
-        return self._as_forecast(query, prediction, episode)
+        if base is not None:
+            prediction.mean = prediction.mean + base
+            if prediction.samples is not None:
+                prediction.samples = prediction.samples + base
+        return prediction
 
     def predict(
         self,
@@ -201,12 +171,7 @@ class DynamicsEstimator(TwoDoorRegressor):
             return float(super().score(X, y, sample_weight))
         if y is not None:
             raise ValueError("y must be omitted with episodes.")
-        ds = as_dataset(X)
-        squared = self.forecast(ds).squared_errors(ds)
-        asked = ~np.isnan(squared)
-        per_episode = -np.where(asked, squared, 0).sum(axis=(1, 2)) / asked.sum(axis=(1, 2))
-        per_episode = np.maximum(per_episode, self.error_score)
-        return float(np.average(per_episode, weights=sample_weight))
+        return self._score_episodes(X, sample_weight)
 
     def predict_trajectory(
         self,
@@ -216,12 +181,14 @@ class DynamicsEstimator(TwoDoorRegressor):
         params: ArrayLike | None = None,
         actions: ArrayLike | None = None,
         policy: Any = None,
-        references: ArrayLike | None = None,
+        references: ArrayLike | Callable[[Floats], ArrayLike] | None = None,
+        context: Mapping[str, Any] | None = None,
+        phase: ArrayLike | None = None,
         return_std: bool = False,
         n_samples: int | None = None,
         random_state: Any = None,
     ) -> Forecast:
-        """Predict from states and parameters alone, without a dataset: for planning.
+        """Predict from states and known signals alone, without a dataset: for planning.
 
         Parameters
         ----------
@@ -232,8 +199,14 @@ class DynamicsEstimator(TwoDoorRegressor):
         actions : array-like of shape (n, n_steps, d_a) or (n_steps, d_a), optional
             One an underlying time step, for one-step models.
         policy : callable, optional
-        references : array-like of shape (n, n_steps + 1, d_r) or (n_steps + 1, d_r), optional
-            At the start and at each underlying step (each horizon, for trajectory models).
+        references : array-like or callable, optional
+            Shape (n, n_steps + 1, d_r) or (n_steps + 1, d_r): at the start and at each underlying
+            step (each horizon, for trajectory models), linear in between. A callable
+            ``references(times (n_t,)) -> (n_t, d_r)``, of times after the start, is asked
+            wherever the model looks.
+        context : mapping from name to a value or n values, optional
+        phase : float or array-like of shape (n,), optional
+            Time since `time_origin` at the start.
         return_std, n_samples, random_state
             As in `forecast`.
 
@@ -241,6 +214,11 @@ class DynamicsEstimator(TwoDoorRegressor):
         -------
         Forecast
             Its `horizons` are those given.
+
+        Raises
+        ------
+        MissingFieldError
+            If the model was fitted with a known signal, context or phase that is not given.
         """
         check_is_fitted(self, "estimator_")
         states = np.atleast_2d(np.asarray(initial_states, dtype=np.float64))
@@ -255,13 +233,18 @@ class DynamicsEstimator(TwoDoorRegressor):
         if wanted.ndim != 1 or not len(wanted) or wanted[0] <= 0 or (np.diff(wanted) <= 0).any():
             raise ValueError("horizons must be positive and strictly increasing times.")
         grid, chosen = self._time_grid(wanted)
+        if callable(references):
+            grid, chosen = self._looked_at(grid, chosen)
+            references = np.asarray(references(np.concatenate([[0.0], grid])), dtype=np.float64)
         n = len(states)
         ds = planned(
             states,
             np.concatenate([[0.0], grid]),
-            params=_broadcast(params, (n,), "params"),
-            actions=_broadcast(actions, (n, len(grid)), "actions"),
-            references=_broadcast(references, (n, len(grid) + 1), "references"),
+            params=broadcast(params, (n,), "params"),
+            actions=broadcast(actions, (n, len(grid)), "actions"),
+            references=broadcast(references, (n, len(grid) + 1), "references"),
+            context={key: by_episode(value, n, key) for key, value in (context or {}).items()},
+            phase=np.full(n, np.nan) if phase is None else by_episode(phase, n, "phase"),
             state_names=self.state_names_,
         )
         use = "auto" if actions is None else "logged"
@@ -279,180 +262,28 @@ class DynamicsEstimator(TwoDoorRegressor):
         """Times to compute, and which of them are the horizons asked for."""
         return horizons, np.arange(len(horizons))
 
-    def predict_reward(
-        self,
-        X: Any,
-        reward: Reward | None = None,
-        *,
-        horizon: int | None = None,
-        return_std: bool = False,
-        n_samples: int = 100,
-        random_state: Any = None,
-        **settings: Any,
-    ) -> Any:
-        """Predict the mean reward per step of each episode.
+    def _looked_at(self, grid: Floats, chosen: NDArray[np.intp]) -> tuple[Floats, NDArray[np.intp]]:
+        """The grid with all times at which references enter, and where `chosen` are in it."""
+        return grid, chosen
 
-        Parameters
-        ----------
-        X : TrajectoryDataset or list of Trajectory
-        reward : callable
-            ``reward(states)`` of the predicted states (n, H, d_s); it may also name
-            `references` and `times`, and `actions` where they are logged.
-        horizon : int or None, default=None
-            Steps from the first state; None takes each episode's own length.
-        return_std : bool, default=False
-            Also return the standard deviation over `n_samples` whole trajectories.
-        n_samples : int, default=100
-        random_state : int, RandomState or None
-        **settings
-            Further arguments of `forecast`.
-
-        Returns
-        -------
-        mean : ndarray of shape (n,)
-            -inf where the forecast diverged.
-        std : ndarray of shape (n,), if asked for
-            inf where some trajectory diverged.
-        """
-        if reward is None:
-            raise ValueError(
-                "give reward=: a function of states; logged rewards are not predicted by a model "
-                "of the states (DirectRewardGP learns them)."
-            )
-        ds = as_dataset(X)
-        forecast = self.forecast(
-            ds,
-            horizon=horizon,
-            n_samples=n_samples if return_std else None,
-            random_state=random_state,
-            **settings,
-        )
-        of = ds if forecast.episode is None else ds[forecast.episode]
-        query = Query(of, forecast.start, forecast.lengths, forecast.times)
-        # like the states, times are finite in the padding
-        times = np.where(query.known(), query.times, query.initial_times[:, None])
-        signals: dict[str, Any] = {"times": times}
-        if of.references is not None:
-            signals["references"] = query.future(of.references, steps=False)[:, 1:]
-        if of.actions is not None and forecast.actions == "logged":
-            signals["actions"] = query.future(of.actions, steps=True)
-        mean = _mean_reward(reward, forecast.mean, forecast.lengths, signals)
-        if not return_std:
-            return mean
-        assert forecast.samples is not None  # asked for above
-        drawn = [_mean_reward(reward, path, forecast.lengths, signals) for path in forecast.samples]
-        with np.errstate(invalid="ignore"):
-            spread = np.std(drawn, axis=0)
-        return mean, np.where(np.isinf(drawn).any(axis=0), np.inf, spread)
-
-    # -- checks and results ---------------------------------------------------------------
+    # -- checks ---------------------------------------------------------------------------
 
     def _checked(self, ds: TrajectoryDataset) -> TrajectoryDataset:
-        d_s = self.state_range_.shape[1]
-        if ds.states.shape[1] != d_s:
-            raise ValueError(
-                f"the episodes have {ds.states.shape[1]} states ({', '.join(ds.state_names)}), the "
-                f"model was fitted on {d_s} ({', '.join(self.state_names_)})."
-            )
-        given = {"params": len(ds.param_names), "references": 2 * len(ds.reference_names)}
+        ds = super()._checked(ds)
+        given = {"params": len(ds.param_names), "references": len(ds.reference_names)}
         for block, width in given.items():
             if block not in self.layout_:
                 continue
-            ds.require(block, by=f"{type(self).__name__} (fitted with {block})")
-            fitted = len(self.layout_.columns[block])
+            columns = self.layout_.columns[block]
+            if block == "references":
+                # they stand there once for each time at which they are looked at
+                ends = [name for name in columns if name.endswith("+h")]
+                columns = tuple(name for name in ends if not name.startswith(BASE))
+            fitted = len(columns)
+            if fitted:
+                ds.require(block, by=f"{type(self).__name__} (fitted with {block})")
             if width != fitted:
-                each = 1 if block == "params" else 2
                 raise ValueError(
-                    f"the episodes have {width // each} {block}, the model was fitted on "
-                    f"{fitted // each}."
+                    f"the episodes have {width} {block}, the model was fitted on {fitted}."
                 )
         return ds
-
-    def _warn_beyond_training(self, query: Query) -> None:
-        longest = np.nanmax(query.horizons)
-        if longest > self.max_horizon_ * (1 + 1e-6):
-            warnings.warn(
-                f"a forecast reaches {longest:g} ahead, the longest horizon in training was "
-                f"{self.max_horizon_:g}: what follows is extrapolation.",
-                HorizonWarning,
-                stacklevel=4,
-            )
-
-    def _as_forecast(
-        self, query: Query, prediction: Prediction, episode: NDArray[np.intp] | None
-    ) -> Forecast:
-        diverged_at = self._mark(prediction, query.known())
-        if diverged_at.any():
-            n_diverged = int((diverged_at > 0).sum())
-            warnings.warn(
-                f"{n_diverged} of {len(query)} forecasts diverged (first at step "
-                f"{diverged_at[diverged_at > 0].min()}): their states are inf from there on. "
-                "A one-step model of an unstable plant does this when it replays logged actions; "
-                "try actions='policy', clip_states=, or TrajectoryRegressor.",
-                DivergenceWarning,
-                stacklevel=4,
-            )
-        return Forecast(
-            prediction.mean,
-            times=query.times,
-            horizons=np.arange(1, query.n_steps + 1),
-            lengths=query.lengths,
-            initial_states=query.initial_states,
-            initial_times=query.initial_times,
-            start=query.start,
-            diverged_at=diverged_at,
-            state_range=self.state_range_,
-            state_names=self.state_names_,
-            actions=prediction.actions,
-            std=prediction.std,
-            samples=prediction.samples,
-            episode=episode,
-        )
-
-    def _mark(self, prediction: Prediction, known: NDArray[np.bool_]) -> NDArray[np.intp]:
-        """Set padding to NaN and everything from a divergence on to inf; return where it begins."""
-        low, high = self.state_range_
-        limit = DIVERGENCE_RANGES * np.where(high > low, high - low, 1.0)
-        with np.errstate(invalid="ignore"):
-            off = np.abs(prediction.mean - (low + high) / 2) > limit
-        gone = (off | ~np.isfinite(prediction.mean)).any(axis=2) & known
-        gone = np.logical_or.accumulate(gone, axis=1)
-        for values in (prediction.mean, prediction.std, prediction.samples):
-            if values is not None:
-                values[..., gone, :] = np.inf
-                values[..., ~known, :] = np.nan
-        return np.where(gone.any(axis=1), gone.argmax(axis=1) + 1, 0)
-
-
-def _seed(random_state: Any) -> Any:
-    from trajlearn.trajectories._relabeler import generator
-
-    return generator(random_state)
-
-
-def _broadcast(values: ArrayLike | None, shape: tuple[int, ...], name: str) -> Floats | None:
-    if values is None:
-        return None
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim not in (len(shape), len(shape) + 1):
-        raise ValueError(f"{name} has shape {array.shape}; expected {(*shape, '...')}.")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} has NaN or infinite values.")
-    try:
-        return np.ascontiguousarray(np.broadcast_to(array, (*shape, array.shape[-1])))
-    except ValueError:
-        raise ValueError(
-            f"{name} has shape {array.shape}; expected {(*shape, array.shape[-1])}."
-        ) from None
-
-
-def _mean_reward(
-    reward: Reward, states: Floats, lengths: NDArray[np.intp], signals: dict[str, Any]
-) -> Floats:
-    """Mean over the predicted steps; -inf for a diverged forecast."""
-    asked = np.arange(states.shape[1]) < lengths[:, None]
-    diverged = np.isinf(states).any(axis=2)
-    finite = np.where((asked & ~diverged)[..., None], states, 0.0)
-    values = step_rewards(reward, finite, **signals)
-    values = np.where(diverged & asked, -np.inf, np.where(asked, values, 0.0))
-    return values.sum(axis=1) / lengths

@@ -103,9 +103,20 @@ def mixture(means: Floats, variances: Floats | None, learner: Any) -> tuple[Floa
     ValueError
         If the learner gives no variance.
     """
+    return mixture_of_members(means, required(variances, learner))
+
+
+def required(variances: Floats | None, learner: Any) -> Floats:
+    """The variances that a learner gives.
+
+    Raises
+    ------
+    ValueError
+        If it gives none.
+    """
     if variances is None:
         raise ValueError(
             f"{type(learner).__name__} gives no standard deviation. Use MLPEnsembleRegressor, "
             "GPRegressor or any regressor whose predict takes return_std."
         )
-    return mixture_of_members(means, variances)
+    return variances

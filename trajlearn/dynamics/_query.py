@@ -8,7 +8,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from trajlearn.exceptions import MixedSamplingError
 from trajlearn.trajectories import TrajectoryDataset
-from trajlearn.trajectories._columns import Columns
 from trajlearn.trajectories.times import episode_steps, time_grids
 
 Floats = NDArray[np.float64]
@@ -28,12 +27,15 @@ class Query:
         Steps to forecast.
     times : ndarray of shape (n, H)
         Absolute time of each step, extended past the log on a uniform grid.
+    base : ndarray of shape (n, H + 1, d_s) or None
+        The baseline at the start and at each step, where the states of `ds` are relative to it.
     """
 
     ds: TrajectoryDataset
     start: Ints
     lengths: Ints
     times: Floats
+    base: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.start)
@@ -137,21 +139,31 @@ def _whole(value: Any, name: str, least: int) -> int:
     return int(value)
 
 
-def _starts(ds: TrajectoryDataset, start: ArrayLike) -> tuple[TrajectoryDataset, Ints, Ints | None]:
-    starts = np.asarray(start)
-    if starts.dtype.kind not in "iu":
-        raise ValueError(f"start must be whole numbers of steps, got {starts.dtype}.")
+def _starts(ds: TrajectoryDataset, start: Any) -> tuple[TrajectoryDataset, Ints, Ints | None]:
+    try:
+        starts = np.asarray(start)
+    except ValueError:
+        # numpy has no array of rows of unequal length
+        starts = np.fromiter(start, dtype=object)
+    by_row = starts.ndim == 2 or starts.dtype == object
+    rows = [np.asarray(row) for row in starts] if by_row else [starts]
+    # the type of an empty row says nothing
+    wrong = [row.dtype for row in rows if row.size and row.dtype.kind not in "iu"]
+    if wrong:
+        raise ValueError(f"start must be whole numbers of steps, got {wrong[0]}.")
     if starts.ndim == 0:
         return ds, np.full(len(ds), int(starts)), None
-    if len(starts) != len(ds) or starts.ndim > 2:
+    if len(starts) != len(ds) or starts.ndim > 2 or (by_row and any(r.ndim != 1 for r in rows)):
         raise ValueError(
             f"start has shape {starts.shape} for {len(ds)} episodes: give one index, one per "
-            "episode (n,), or several per episode (n, k)."
+            "episode (n,), or several per episode: (n, k), or n arrays of unequal length."
         )
-    if starts.ndim == 1:
+    if not by_row:
         return ds, starts.astype(np.intp), None
-    episode = np.repeat(np.arange(len(ds)), starts.shape[1])
-    return ds[episode], starts.ravel().astype(np.intp), episode
+    episode = np.repeat(np.arange(len(ds)), [len(row) for row in rows])
+    if not len(episode):
+        raise ValueError("start has no index in any episode, so there is nothing to forecast.")
+    return ds[episode], np.concatenate(rows).astype(np.intp), episode
 
 
 def _to_end_of_stretch(ds: TrajectoryDataset, starts: Ints) -> Ints:
@@ -186,41 +198,3 @@ def _times(ds: TrajectoryDataset, starts: Ints, n_steps: int, lengths: Ints) -> 
             )
         times = times + np.where(past_log, step, 0.0)[:, None] * np.maximum(beyond, 0)
     return np.where(asked, times, np.nan)
-
-
-def planned(
-    initial_states: Floats,
-    times: Floats,
-    *,
-    params: Floats | None,
-    actions: Floats | None,
-    references: Floats | None,
-    state_names: tuple[str, ...],
-) -> TrajectoryDataset:
-    """Episodes that have only begun: known future signals, and no state but the first.
-
-    Built without a loop over episodes, for planning over thousands of candidates.
-    """
-    n, n_states = len(initial_states), len(times)
-    columns = Columns(
-        offsets=np.arange(n + 1) * n_states,
-        states=np.repeat(initial_states, n_states, axis=0),
-        times=np.tile(times, n),
-        terminated=np.zeros(n, dtype=bool),
-        time_origin=np.full(n, np.nan),
-        ids=np.arange(n),
-        actions=None if actions is None else actions.reshape(-1, actions.shape[-1]),
-        params=None if params is None or not params.shape[1] else params,
-        references=None if references is None else references.reshape(-1, references.shape[-1]),
-    )
-    names = {
-        "states": state_names,
-        "actions": _numbered("a", actions),
-        "params": _numbered("theta", columns.params),
-        "references": _numbered("ref", references),
-    }
-    return TrajectoryDataset._of(columns, names)
-
-
-def _numbered(prefix: str, values: Floats | None) -> tuple[str, ...]:
-    return () if values is None else tuple(f"{prefix}{i}" for i in range(values.shape[-1]))

@@ -8,9 +8,10 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from trajlearn._sklearn import Interval, StrOptions
+from trajlearn._sklearn import HasMethods, Interval, StrOptions
 from trajlearn.dynamics._base import TwoDoorRegressor
-from trajlearn.dynamics._dynamics import DIVERGENCE_RANGES, DynamicsEstimator, Prediction
+from trajlearn.dynamics._dynamics import DynamicsEstimator
+from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES, Prediction
 from trajlearn.dynamics._learner import spread
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics._rollout import InputRows, Limits, Step, roll_out
@@ -38,6 +39,7 @@ class RollingEstimator(DynamicsEstimator):
         **TwoDoorRegressor._parameter_constraints,
         "inputs": [StrOptions({"action", "params"}), "array-like"],
         "target": [StrOptions({"change", "state"})],
+        "baseline": [StrOptions({"mean"}), callable, HasMethods(["predict"]), None],
         "policy": [callable, None],
         "rollout_actions": [StrOptions({"auto", "logged", "policy"})],
         "clip_states": [Interval(Real, 0, None, closed="neither"), None],
@@ -87,19 +89,19 @@ class RollingEstimator(DynamicsEstimator):
         if not hasattr(self.relabeler_, "dt_"):
             states = np.concatenate([rows[:, self.layout_["state"]], targets])
             self._learn_ranges(states, tuple(self.layout_.columns["state"]), np.inf)
+            self.rolled_range_ = self.state_range_
             self.relabeler_.dt_ = None
         self.dt_ = self.relabeler_.dt_
         largest = np.abs(targets).max(axis=0)
         self.target_scale_ = spread(self._change(rows, targets), largest, weight)
         super()._fit_rows(rows, targets, weight, groups)
 
-    def _fit_episodes(
+    def _fit_states(
         self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
     ) -> None:
         rows, targets = self.relabeler_.fit_resample(ds)
         self.layout_ = self.relabeler_.layout_
-        # a model of one step knows no longest horizon
-        self._learn_ranges(ds.states, ds.state_names, np.inf)
+        self.rolled_range_ = np.stack([ds.states.min(axis=0), ds.states.max(axis=0)])
         episode = self.relabeler_.sample_indices_
         self._fit_rows(
             rows,
@@ -154,7 +156,7 @@ class RollingEstimator(DynamicsEstimator):
                 'Resample them (ds.resample), or fit with "dt" among inputs=.'
             )
 
-    def _forecast(
+    def _forecast_states(
         self,
         query: Query,
         *,
@@ -190,7 +192,7 @@ class RollingEstimator(DynamicsEstimator):
         return prediction
 
     def _limits(self) -> Limits:
-        low, high = self.state_range_
+        low, high = self.rolled_range_
         width = np.where(high > low, high - low, 1.0)
         centre = (low + high) / 2
         clip = None
@@ -216,14 +218,18 @@ class RollingEstimator(DynamicsEstimator):
             logged = query.future(ds.actions, steps=True)
         times = np.concatenate([query.initial_times[:, None], query.times], axis=1)
         times = _filled(times)
+        previous = np.empty(0)
 
         def inputs(states: Floats, k: int) -> Floats:
+            nonlocal previous
             now: dict[str, Floats] = {"state": states}
             if logged is not None:
                 blocks["action"] = logged[:, k]
             elif source == "policy":
                 by_copy = np.tile(theta[:, k], (copies, 1))
-                actions = policy(states, by_copy, np.tile(times[:, k], copies))
+                # the controller knows the state itself, not what it is relative to
+                base = 0.0 if query.base is None else np.tile(query.base[:, k], (copies, 1))
+                actions = policy(states + base, by_copy, np.tile(times[:, k], copies))
                 now["action"] = _checked_actions(actions, self.layout_["action"], states)
             if "params" in self.layout_:
                 blocks["params"] = theta[:, k]
@@ -235,9 +241,28 @@ class RollingEstimator(DynamicsEstimator):
                 )
             for block, values in blocks.items():
                 now[block] = values if copies == 1 else np.tile(values, (copies, 1))
+            if "previous" in self.layout_:
+                now["previous"] = self._before(query, now["action"]) if k == 0 else previous
+                previous = now["action"]
             return self.layout_.assemble(now)
 
         return inputs
+
+    def _before(self, query: Query, actions: Floats) -> Floats:
+        """Action before the start of each row; the first of an episode has none but itself."""
+        ds, started = query.ds, query.start > 0
+        if not started.any():
+            return actions
+        if ds.actions is None:
+            raise MissingFieldError(
+                f"{type(self).__name__} was fitted with the previous action, but the episodes have "
+                "no actions before the start. Give them, or forecast from the first state."
+            )
+        copies = len(actions) // len(query)
+        step = query.rows - np.arange(len(query)) - started
+        return np.where(
+            np.tile(started, copies)[:, None], np.tile(ds.actions[step], (copies, 1)), actions
+        )
 
     def _theta(self, query: Query) -> Floats:
         """theta_t along the roll-out (n, H, p)."""

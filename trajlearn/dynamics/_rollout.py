@@ -78,7 +78,9 @@ def expected_step(moments: Moments) -> Step:
 
 
 def sampled_step(
-    moments: Moments, member: NDArray[np.intp] | None, rng: np.random.Generator
+    moments: Callable[[Floats], tuple[Floats, Floats]],
+    member: NDArray[np.intp] | None,
+    rng: np.random.Generator,
 ) -> Step:
     """One member a particle, with its noise: fixed (TSinf), or drawn anew at every step (TS1).
 
@@ -92,7 +94,6 @@ def sampled_step(
 
     def step(rows: Floats, k: int) -> Floats:
         means, variances = moments(rows)
-        assert variances is not None  # checked before the roll-out
         which = rng.integers(len(means), size=len(rows)) if member is None else member
         particle = np.arange(len(rows))
         noise = rng.standard_normal(means.shape[1:])

@@ -224,7 +224,10 @@ class Forecast:
     def squared_errors(self, truth: TrajectoryDataset) -> Floats:
         """Squared error of each state in units of its training range (n, H, d_s).
 
-        NaN where `truth` or the forecast has no such step; +inf from the divergence on.
+        NaN where `truth` or the forecast has no such step; +inf from the divergence on. A
+        dataset whose states are a transformer's estimates is compared by its `observed`, the
+        states as logged. Of a forecast that has states `truth` lacks (``d_<name>``, estimated
+        velocities) or lacks states that it has, those of the same names are compared.
 
         Parameters
         ----------
@@ -234,6 +237,7 @@ class Forecast:
         Returns
         -------
         ndarray of shape (n, H, d_s)
+            d_s: the states that both have, in the order of the forecast.
 
         Raises
         ------
@@ -247,20 +251,16 @@ class Forecast:
             )
         if self.episode is None and len(truth) != len(self):
             raise ValueError(f"{len(self)} forecasts, but {len(truth)} episodes to compare with.")
-        if truth.states.shape[1] != self.mean.shape[2]:
-            raise ValueError(
-                f"the forecast has {self.mean.shape[2]} states ({', '.join(self.state_names)}), "
-                f"the episodes {truth.states.shape[1]} ({', '.join(truth.state_names)})."
-            )
+        columns, _, logged = shared_states(self.state_names, truth)
         episode = np.arange(len(self)) if self.episode is None else self.episode
         steps = self.start[:, None] + self.horizons[None, :]
         known = steps <= truth.lengths[episode][:, None]
         known &= np.arange(len(self.horizons)) < self.lengths[:, None]
         rows = truth.offsets[:-1][episode][:, None] + np.where(known, steps, 0)
-        low, high = self.state_range
+        low, high = self.state_range[:, columns]
         width = np.where(high > low, high - low, 1.0)
         with np.errstate(over="ignore", invalid="ignore"):
-            squared = ((self.mean - truth.states[rows]) / width) ** 2
+            squared = ((self.mean[..., columns] - logged[rows]) / width) ** 2
         diverged = (self.diverged_at > 0)[:, None] & (
             np.arange(1, len(self.horizons) + 1) >= self.diverged_at[:, None]
         )
@@ -322,6 +322,43 @@ class Forecast:
             if self.std is not None:
                 columns[f"{name}_std"] = self.std[..., j].ravel()
         return pd.DataFrame(columns)[kept].reset_index(drop=True)
+
+
+def shared_states(
+    names: Sequence[str], truth: TrajectoryDataset
+) -> tuple[NDArray[np.intp], tuple[str, ...], Floats]:
+    """Which of the forecast states `names` were logged, and the logged values.
+
+    Returns
+    -------
+    columns : ndarray of shape (k,)
+        Positions in `names`.
+    shared : tuple of str
+        Names in `truth`.
+    logged : ndarray of shape (sum of T + 1, k)
+
+    Raises
+    ------
+    ValueError
+        If the forecast and the episodes are of different states.
+    """
+    logged, known = truth.states, truth.state_names
+    if truth.observed is not None:
+        logged, known = truth.observed, truth.observed_names
+    every = np.arange(len(names), dtype=np.intp)
+    if tuple(names) == known:
+        return every, known, logged
+    shared = tuple(name for name in names if name in known)
+    derived = [name for name in names if name not in known and not name.startswith("d_")]
+    if shared and (not derived or len(shared) == len(known)):
+        index = [known.index(name) for name in shared]
+        return every[np.isin(names, shared)], shared, logged[:, index]
+    if not shared and len(names) == len(known):
+        return every, known, logged
+    raise ValueError(
+        f"the forecast has {len(names)} states ({', '.join(names)}), the episodes {len(known)} "
+        f"({', '.join(known)}): give the episodes that were forecast, with the same names."
+    )
 
 
 def _without_forecasts(value: Any) -> Any:

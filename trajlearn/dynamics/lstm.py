@@ -64,6 +64,9 @@ class LSTMRegressor(RollingEstimator):
         is given.
     target : {"change", "state"}, default="change"
         Learn s_{t+1} - s_t, or s_{t+1} itself.
+    baseline : {"mean", None}, callable or forecaster, default=None
+        What states are relative to, as in `TrajectoryRegressor`: a callable of the references
+        makes it a model of the tracking error. A policy still gets the states themselves.
     policy : callable or None, default=None
         ``policy(states (n, d_s), params (n, p), times (n,)) -> actions (n, d_a)``, for roll-outs.
     rollout_actions : {"auto", "logged", "policy"}, default="auto"
@@ -92,6 +95,7 @@ class LSTMRegressor(RollingEstimator):
         Time step of the training episodes; None where it is an input or unknown (rows).
     state_range_ : ndarray of shape (2, d_s)
         Least and greatest training states.
+    baseline_ : forecaster or None
     n_features_in_ : int
 
     See Also
@@ -157,6 +161,7 @@ class LSTMRegressor(RollingEstimator):
         scaler: Any = None,
         inputs: str | Sequence[str] = "action",
         target: str = "change",
+        baseline: Any = None,
         policy: Any = None,
         rollout_actions: str = "auto",
         clip_states: float | None = None,
@@ -180,6 +185,7 @@ class LSTMRegressor(RollingEstimator):
         self.scaler = scaler
         self.inputs = inputs
         self.target = target
+        self.baseline = baseline
         self.policy = policy
         self.rollout_actions = rollout_actions
         self.clip_states = clip_states
@@ -225,7 +231,7 @@ class LSTMRegressor(RollingEstimator):
         """
         return self._fit(X, y, None, groups)
 
-    def _fit_episodes(
+    def _fit_states(
         self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
     ) -> None:
         max_rows, n_steps = getattr(self.relabeler_, "max_rows", None), int(ds.lengths.sum())
@@ -234,7 +240,7 @@ class LSTMRegressor(RollingEstimator):
                 f"relabeler has max_rows={max_rows}, but a sequence needs every step (there are "
                 f"{n_steps}); use max_rows=None, and fewer episodes or window= to save time."
             )
-        super()._fit_episodes(ds, None, None)
+        super()._fit_states(ds, None, None)
 
     def _fit_rows(self, rows: Floats, targets: Floats, weight: Floats | None, groups: Any) -> None:
         # the learner's groups are its sequences: episodes, or single rows
@@ -264,7 +270,9 @@ class LSTMRegressor(RollingEstimator):
         for k in range(start.max()):
             episode = np.flatnonzero(start > k)
             begin = ds.offsets[episode] + k
-            rows = np.zeros((len(query), self.layout_.width))
-            rows[episode] = self.relabeler_.rows(ds, episode, begin, begin + 1)
+            own = self.relabeler_.rows(ds, episode, begin, begin + 1)
+            # episodes that have begun wait; their rows must be possible ones all the same
+            rows = np.tile(own[0], (len(query), 1))
+            rows[episode] = own
             memory.step(self._scaled(rows), start > k)
         return memory

@@ -6,10 +6,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from trajlearn._sklearn import StrOptions
-from trajlearn.dynamics._learner import Moments, mixture
+from trajlearn.dynamics._learner import required
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics._rolling import RollingEstimator
-from trajlearn.dynamics._rollout import Step, expected_step, sampled_step
+from trajlearn.dynamics._rollout import Floats, Step, expected_step, sampled_step
 from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 from trajlearn.trajectories import TransitionRelabeler
@@ -40,6 +40,9 @@ class OneStepRegressor(RollingEstimator):
         closed-loop variant. Ignored if `relabeler` is given.
     target : {"change", "state"}, default="change"
         Learn s_{t+1} - s_t, or s_{t+1} itself.
+    baseline : {"mean", None}, callable or forecaster, default=None
+        What states are relative to, as in `TrajectoryRegressor`: a callable of the references
+        makes it a model of the tracking error. A policy still gets the states themselves.
     policy : callable or None, default=None
         ``policy(states (n, d_s), params (n, p), times (n,)) -> actions (n, d_a)``, for roll-outs.
     rollout_actions : {"auto", "logged", "policy"}, default="auto"
@@ -64,6 +67,7 @@ class OneStepRegressor(RollingEstimator):
         Time step of the training episodes; None where it is an input or unknown (rows).
     state_range_ : ndarray of shape (2, d_s)
         Least and greatest training states.
+    baseline_ : forecaster or None
     n_features_in_ : int
 
     See Also
@@ -105,6 +109,7 @@ class OneStepRegressor(RollingEstimator):
         scaler: Any = None,
         inputs: str | Sequence[str] = "action",
         target: str = "change",
+        baseline: Any = None,
         policy: Any = None,
         rollout_actions: str = "auto",
         clip_states: float | None = None,
@@ -118,6 +123,7 @@ class OneStepRegressor(RollingEstimator):
         self.scaler = scaler
         self.inputs = inputs
         self.target = target
+        self.baseline = baseline
         self.policy = policy
         self.rollout_actions = rollout_actions
         self.clip_states = clip_states
@@ -139,18 +145,18 @@ class OneStepRegressor(RollingEstimator):
         moments = self._moments()
         if rng is None:
             return expected_step(moments)
-        self._check_uncertainty(moments)
-        member = None
-        n_members = getattr(self.estimator_, "n_members", 1)
-        if self.propagation == "tsinf":
-            member = np.repeat(rng.permutation(np.arange(copies) % n_members), len(query))
-        return sampled_step(moments, member, rng)
-
-    def _check_uncertainty(self, moments: Moments) -> None:
         if self.propagation == "expectation":
             raise ValueError(
                 'propagation="expectation" carries no uncertainty: choose "tsinf" or "ts1" for '
                 "return_std= or n_samples=."
             )
-        means, variances = moments(np.zeros((1, self.layout_.width)))
-        mixture(means, variances, self.estimator_)
+
+        def spread(rows: Floats) -> tuple[Floats, Floats]:
+            means, variances = moments(rows)
+            return means, required(variances, self.estimator_)
+
+        member = None
+        n_members = getattr(self.estimator_, "n_members", 1)
+        if self.propagation == "tsinf":
+            member = np.repeat(rng.permutation(np.arange(copies) % n_members), len(query))
+        return sampled_step(spread, member, rng)

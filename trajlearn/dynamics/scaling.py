@@ -17,6 +17,7 @@ from sklearn.preprocessing import (
 from sklearn.utils.validation import check_is_fitted, has_fit_parameter, validate_data
 
 from trajlearn._sklearn import HasMethods, Interval, StrOptions
+from trajlearn.dynamics.phase import PhaseFeatures
 from trajlearn.trajectories._layout import Layout
 
 __all__ = ["BlockScaler", "HorizonFeatures"]
@@ -28,7 +29,7 @@ _AFFINE = (StandardScaler, MinMaxScaler, MaxAbsScaler, RobustScaler)
 # a spread below this share of the largest magnitude is round-off
 _CONSTANT = 1e-6
 # blocks that share the slot of another
-_SLOT_OF = {"references": "state", "dt": "action", "phase": "action"}
+_SLOT_OF = {"references": "state", "dt": "action", "previous": "action"}
 
 
 class HorizonFeatures(TransformerMixin, BaseEstimator):
@@ -121,7 +122,7 @@ class BlockScaler(TransformerMixin, BaseEstimator):
 
     Parameters
     ----------
-    state, action, horizon, params : transformer, "passthrough" or None, default=None
+    state, action, horizon, params, phase : transformer, "passthrough" or None, default=None
         What each block is scaled by.
     features : callable or None, default=None
         ``features(states (n, d_s), params (n, p)) -> (n, k)``: what is known to matter, such as
@@ -139,7 +140,7 @@ class BlockScaler(TransformerMixin, BaseEstimator):
 
     See Also
     --------
-    HorizonFeatures : the choice of `TrajectoryRegressor` for `horizon`.
+    HorizonFeatures, PhaseFeatures : the choice of `TrajectoryRegressor` for horizon and phase.
 
     Examples
     --------
@@ -162,7 +163,7 @@ class BlockScaler(TransformerMixin, BaseEstimator):
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         slot: [HasMethods(["fit", "transform"]), StrOptions({"passthrough"}), None]
-        for slot in ("state", "action", "horizon", "params")
+        for slot in ("state", "action", "horizon", "params", "phase")
     } | {"features": [callable, None]}
 
     def __init__(
@@ -172,12 +173,14 @@ class BlockScaler(TransformerMixin, BaseEstimator):
         action: Any = None,
         horizon: Any = None,
         params: Any = None,
+        phase: Any = None,
         features: Callable[[Floats, Floats], Any] | None = None,
     ) -> None:
         self.state = state
         self.action = action
         self.horizon = horizon
         self.params = params
+        self.phase = phase
         self.features = features
 
     def fit(
@@ -297,7 +300,7 @@ class BlockScaler(TransformerMixin, BaseEstimator):
             return FunctionTransformer()
         if chosen is not None:
             return clone(chosen)
-        return StandardScaler() if slot in ("state", "action") else MinMaxScaler((-1, 1))
+        return StandardScaler() if slot in ("state", "action", "phase") else MinMaxScaler((-1, 1))
 
     def _set_affine(self) -> None:
         """Scale and shift of all outputs, where every part is affine: one fused operation."""
@@ -340,7 +343,7 @@ class BlockScaler(TransformerMixin, BaseEstimator):
             values = X[:, columns]
             if transformer is None:
                 parts.append(values / self.magnitude_[columns])
-            elif isinstance(transformer, HorizonFeatures):
+            elif isinstance(transformer, (HorizonFeatures, PhaseFeatures)):
                 parts.append(transformer.features(values))
             elif (affine := _affine(transformer, len(columns))) is not None:
                 parts.append(values * affine[0] + affine[1])

@@ -6,12 +6,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from trajlearn._sklearn import Interval, StrOptions
+from trajlearn._sklearn import HasMethods, Interval, StrOptions
 from trajlearn.dynamics._base import TwoDoorRegressor
-from trajlearn.dynamics._dynamics import DynamicsEstimator, Prediction
-from trajlearn.dynamics._learner import mixture, spread, takes_weights
+from trajlearn.dynamics._dynamics import DynamicsEstimator
+from trajlearn.dynamics._forecaster import Prediction
+from trajlearn.dynamics._learner import mixture, required, spread, takes_weights
 from trajlearn.dynamics._query import Query, make_query
-from trajlearn.dynamics.scaling import BlockScaler, HorizonFeatures
+from trajlearn.dynamics.scaling import BlockScaler, HorizonFeatures, PhaseFeatures
 from trajlearn.regressors._prediction import mean_of_members
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 from trajlearn.trajectories import SubtrajectoryRelabeler, TrajectoryDataset
@@ -38,22 +39,36 @@ class TrajectoryRegressor(DynamicsEstimator):
     The controller enters by its parameters theta, not by its actions, so that nothing is rolled
     out and errors do not compound. Trained on all sub-trajectories of the episodes:
 
-    .. math:: s_{t+h} = b + g(h)\,\sigma \odot f(s_t, h, \theta),
+    .. math:: s_{t+h} = s_t + g(h)\,\sigma \odot f(s_t, h, \theta),
 
-    with the baseline b = s_t, the gate :math:`g(h) = 1 - e^{-h / \tau}`, which makes short
-    horizons exact, and the scale :math:`\sigma` of the change of state. T, TP, TE and TPE of the
-    paper are the choices ``n_members`` and ``probabilistic`` of the learner.
+    with the gate :math:`g(h) = 1 - e^{-h / \tau}`, which makes short horizons exact, and the scale
+    :math:`\sigma` of the change of state. T, TP, TE and TPE of the paper are the choices
+    ``n_members`` and ``probabilistic`` of the learner.
+
+    Where a reference drives the plant, or all episodes do much the same, a prediction relative
+    to a `baseline` b(t) of that motion learns what is left of it, the deviation d = s - b:
+
+    .. math:: s_{t+h} = b_{t+h} + (1 - g(h))\,d_t + g(h)\,\sigma \odot f(d_t, h, \theta, \dots).
+
+    References (at t, at knots and at t + h), the phase and the context are inputs where the
+    episodes have them.
 
     Parameters
     ----------
     estimator : regressor or None, default=None
         Any scikit-learn regressor; None: `MLPEnsembleRegressor`.
     relabeler : SubtrajectoryRelabeler or None, default=None
-        None: ``SubtrajectoryRelabeler(starts="early", horizons="mixture")``.
+        None: ``SubtrajectoryRelabeler(starts="early", horizons="mixture", n_knots=3)``.
     scaler : transformer or None, default=None
-        None: `BlockScaler` with `HorizonFeatures` for the horizon.
-    baseline : {"state", None}, default="state"
-        What a prediction is relative to; None predicts the state itself, as the paper does.
+        None: `BlockScaler` with `HorizonFeatures` for the horizon and `PhaseFeatures` for the
+        phase.
+    baseline : {"state", "mean", None}, callable or forecaster, default="state"
+        What a prediction is relative to. "state": the state at the start. None: nothing, as in
+        the paper. A callable ``state_of(references (m, d_r)) -> (m, d_s)``: the reference, see
+        `ReferenceForecaster`. "mean": the mean episode at that phase, see
+        `MeanEpisodeForecaster`. An estimator with ``fit(ds)`` and ``predict(ds) -> Forecast``:
+        its forecast from the first state. One that learns is fitted inside, and predicts each
+        training episode out of fold; ``FrozenEstimator(fitted)`` is taken as it is.
     gate : float or None, default=0.05
         Time constant of the gate as a fraction of the longest horizon; None for no gate.
     fresh_batches : bool, default=True
@@ -67,6 +82,7 @@ class TrajectoryRegressor(DynamicsEstimator):
     ----------
     estimator_, relabeler_, scaler_
         As fitted.
+    baseline_ : forecaster or None
     layout_ : mapping from block to slice
     max_horizon_ : float
         Longest horizon in training, as a time.
@@ -101,7 +117,7 @@ class TrajectoryRegressor(DynamicsEstimator):
     _needs_constant_params = True
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **TwoDoorRegressor._parameter_constraints,
-        "baseline": [StrOptions({"state"}), None],
+        "baseline": [StrOptions({"state", "mean"}), callable, HasMethods(["predict"]), None],
         "gate": [Interval(Real, 0, None, closed="neither"), None],
         "fresh_batches": ["boolean"],
         "error_score": [Interval(Real, None, 0, closed="both")],
@@ -113,7 +129,7 @@ class TrajectoryRegressor(DynamicsEstimator):
         *,
         relabeler: Any = None,
         scaler: Any = None,
-        baseline: str | None = "state",
+        baseline: Any = "state",
         gate: float | None = 0.05,
         fresh_batches: bool = True,
         error_score: float = -1e12,
@@ -131,8 +147,8 @@ class TrajectoryRegressor(DynamicsEstimator):
     def _defaults(self) -> dict[str, Any]:
         return {
             "estimator": MLPEnsembleRegressor(),
-            "relabeler": SubtrajectoryRelabeler(starts="early", horizons="mixture"),
-            "scaler": BlockScaler(horizon=HorizonFeatures()),
+            "relabeler": SubtrajectoryRelabeler(starts="early", horizons="mixture", n_knots=3),
+            "scaler": BlockScaler(horizon=HorizonFeatures(), phase=PhaseFeatures()),
         }
 
     def _layout_of_rows(self, n_features: int, n_targets: int) -> Layout:
@@ -154,12 +170,12 @@ class TrajectoryRegressor(DynamicsEstimator):
         self._learn_scale(rows, targets, weight)
         super()._fit_rows(rows, targets, weight, groups)
 
-    def _fit_episodes(
+    def _fit_states(
         self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
     ) -> None:
         relabeler = self.relabeler_.fit(ds)
         self.layout_ = relabeler.layout_
-        self._learn_ranges(ds.states, ds.state_names, self._longest_horizon(ds))
+        self.max_horizon_ = self._longest_horizon(ds)
         if self.fresh_batches and hasattr(self.estimator_, "fit_stream"):
             self._fit_stream(ds, weight)
         else:
@@ -206,12 +222,18 @@ class TrajectoryRegressor(DynamicsEstimator):
         self.estimator_.fit_stream(draw, n_rows=self.relabeler_.n_pairs(ds))
 
     def _learn_scale(self, rows: Floats, targets: Floats, weight: Floats | None) -> None:
-        """Scale of what is predicted: the state, or its change."""
+        """Scale of what is predicted: the state, its change, or its deviation from the baseline."""
         largest = np.abs(targets).max(axis=0)
-        self.target_scale_ = spread(targets - self._baseline(rows), largest, weight)
+        change = self.baseline is not None and self.baseline_ is None
+        start = rows[:, self.layout_["state"]] if change else 0.0
+        self.target_scale_ = spread(targets - start, largest, weight)
 
-    def _baseline(self, rows: Floats) -> Floats | float:
-        return rows[:, self.layout_["state"]] if self.baseline == "state" else 0.0
+    def _anchor(self, rows: Floats, gate: Floats) -> Floats | float:
+        """Where a prediction is while the gate is shut: at the start, or leaving it."""
+        if self.baseline is None:
+            return 0.0
+        start = rows[:, self.layout_["state"]]
+        return start if self.baseline_ is None else (1 - gate) * start
 
     def _gate(self, rows: Floats) -> Floats:
         """g(h) of each row (n, 1); not quite 0 at h = 0, since targets are divided by it."""
@@ -226,14 +248,14 @@ class TrajectoryRegressor(DynamicsEstimator):
         if not takes_weights(self.estimator_):
             gate = np.ones_like(gate)
         self._gated = takes_weights(self.estimator_)
-        z = (targets - self._baseline(rows)) / (gate * self.target_scale_)
+        z = (targets - self._anchor(rows, gate)) / (gate * self.target_scale_)
         # the squared error of the state, not of z
         return z, gate[:, 0] ** 2 if (gate != 1).any() else None
 
     def _restore(self, rows: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:
-        gate = self._gate(rows) if self._gated else 1.0
+        gate = self._gate(rows) if self._gated else np.ones((len(rows), 1))
         scale = gate * self.target_scale_
-        return self._baseline(rows) + scale * means, scale**2 * variances
+        return self._anchor(rows, gate) + scale * means, scale**2 * variances
 
     def _learn_noise_time(self, ds: TrajectoryDataset) -> None:
         """Correlation time of standardised residuals along training episodes, by state."""
@@ -258,7 +280,7 @@ class TrajectoryRegressor(DynamicsEstimator):
     def _reads_logged_future(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
         return "references" in self.layout_
 
-    def _forecast(
+    def _forecast_states(
         self,
         query: Query,
         *,
@@ -271,10 +293,10 @@ class TrajectoryRegressor(DynamicsEstimator):
         means, variances = self._at(query)
         prediction = Prediction(mean_of_members(means))
         if return_std or n_samples:
-            _, variance = mixture(means, variances, self.estimator_)
-            prediction.std = np.sqrt(variance) if return_std else None
-        if n_samples:
-            assert variances is not None  # mixture() has checked
+            variances = required(variances, self.estimator_)
+            std = np.sqrt(mixture(means, variances, self.estimator_)[1])
+            prediction.std = std if return_std else None
+        if n_samples and variances is not None:
             prediction.samples = self._sample(query, means, variances, n_samples, rng)
         return prediction
 
@@ -286,7 +308,7 @@ class TrajectoryRegressor(DynamicsEstimator):
         splits = (
             isinstance(self.estimator_, MLPEnsembleRegressor)
             and isinstance(self.scaler_, BlockScaler)
-            and "references" not in self.layout_
+            and not {"references", "phase"} & set(self.layout_)
         )
         if splits and ((horizons == longest) | ~query.known()).all():
             return self._at_split_rows(query, np.arange(n), longest[None])
@@ -307,17 +329,21 @@ class TrajectoryRegressor(DynamicsEstimator):
     ) -> tuple[Floats, Floats | None]:
         """Some starts at horizons (len(some), H) of their own, row by row."""
         n_steps = horizons.shape[1]
-        start = query.rows[some]
-        rows = self.relabeler_.rows(query.ds, some, start, start)
+        ds, start = query.ds, query.rows[some]
+        rows = self.relabeler_.rows(ds, some, start, start)
         rows = np.repeat(rows, n_steps, axis=0)
         rows[:, self.layout_["horizon"]] = horizons.reshape(-1, 1)
+        if "phase" in self.layout_:
+            begin = np.repeat(query.initial_times[some], n_steps)
+            rows[:, self.layout_["phase"]] = self.relabeler_.phase_rows(
+                ds, np.repeat(some, n_steps), begin, begin + horizons.ravel()
+            )
         if "references" in self.layout_:
-            references = query.ds.references
-            assert references is not None  # the relabeler has checked
-            ahead = query.future(references, steps=False)[some, 1:]
-            block = self.layout_["references"]
-            half = (block.stop - block.start) // 2
-            rows[:, block.start + half : block.stop] = ahead.reshape(-1, half)
+            last = ds.offsets[1:][some, None] - 1
+            end = np.minimum(start[:, None] + np.arange(1, n_steps + 1), last)
+            rows[:, self.layout_["references"]] = self.relabeler_.reference_rows(
+                ds, np.repeat(start, n_steps), end.ravel()
+            )
         means, variances = self._moments()(rows)
         shape = (len(means), len(some), n_steps, means.shape[-1])
         return means.reshape(shape), None if variances is None else variances.reshape(shape)
@@ -347,10 +373,20 @@ class TrajectoryRegressor(DynamicsEstimator):
         means, variances = (
             part.reshape(len(part), *shape, -1) for part in self.estimator_.moments(outputs)
         )
-        gate = self._gate(right).reshape(*horizons.shape, 1) if self._gated else 1.0
+        gate = self._gate(right) if self._gated else np.ones((len(right), 1))
+        gate = gate.reshape(*horizons.shape, 1)
         scale = gate * self.target_scale_
-        base = query.initial_states[some, None] if self.baseline == "state" else 0.0
-        return base + scale * means, scale**2 * variances
+        anchor: Floats | float = 0.0
+        if self.baseline is not None:
+            start_states = query.initial_states[some, None]
+            anchor = start_states if self.baseline_ is None else (1 - gate) * start_states
+        return anchor + scale * means, scale**2 * variances
+
+    def _looked_at(self, grid: Floats, chosen: NDArray[np.intp]) -> tuple[Floats, NDArray[np.intp]]:
+        n_knots = getattr(self.relabeler_, "n_knots", 0)
+        parts = np.arange(1, n_knots + 2) / (n_knots + 1)
+        times = np.unique(np.outer(grid, parts))
+        return times, np.searchsorted(times, grid)[chosen]
 
     def _sample(
         self,

@@ -11,6 +11,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from trajlearn.exceptions import MissingFieldError
 from trajlearn.trajectories._layout import Layout
+from trajlearn.trajectories._signals import interpolate
 from trajlearn.trajectories.coerce import as_dataset
 from trajlearn.trajectories.dataset import TrajectoryDataset
 from trajlearn.trajectories.times import time_differences
@@ -34,6 +35,7 @@ class Relabeler(BaseEstimator):
     _blocks: ClassVar[tuple[str, ...]]
     _required: ClassVar[tuple[str, ...]]
     inputs: Any
+    n_knots: int = 0
 
     def __sklearn_tags__(self) -> Tags:
         tags = super().__sklearn_tags__()
@@ -95,8 +97,17 @@ class Relabeler(BaseEstimator):
             "state": ds.state_names,
             "action": ds.action_names,
             "params": ds.param_names,
-            "references": (*ds.reference_names, *(f"{name}+h" for name in ds.reference_names)),
+            "previous": tuple(f"{name}-1" for name in ds.action_names),
+            "references": tuple(
+                f"{name}{at}" for at in self._knot_names() for name in ds.reference_names
+            ),
+            "phase": ("phase", "phase+h"),
         }.get(block, (block,))
+
+    def _knot_names(self) -> tuple[str, ...]:
+        """Suffixes of the reference columns: at t, at the knots between, at t + h."""
+        between = (f"+{j}/{self.n_knots + 1}h" for j in range(1, self.n_knots + 1))
+        return ("", *between, "+h")
 
     def get_feature_names_out(self, input_features: Any = None) -> NDArray[np.object_]:
         """Names of the columns of a row.
@@ -184,21 +195,69 @@ class Relabeler(BaseEstimator):
         if block == "context":
             return self.context_rows(ds).take(episode, axis=0)
         if block == "phase":
-            origin = ds.time_origin[episode]
-            if np.isnan(origin).any():
-                raise MissingFieldError(
-                    f"episode {ds.ids[episode[np.isnan(origin)][0]]} has no time_origin, so its "
-                    "phase is unknown. Give it, or leave 'phase' out of inputs= and fit again."
-                )
-            return (ds.times[begin] - origin)[:, None]
-        if block == "action":
+            return self.phase_rows(ds, episode, ds.times[begin], ds.times[end])
+        if block in ("action", "previous"):
             if ds.actions is None:
                 raise MissingFieldError("the episodes have no actions, which fit saw.")
             # an episode has one action less than states
-            return ds.actions.take(begin - episode, axis=0)
+            step = begin - episode
+            if block == "previous":
+                # before the first step its own action is as good a guess as any
+                step = np.maximum(step - 1, ds.offsets[episode] - episode)
+            return ds.actions.take(step, axis=0)
+        return self.reference_rows(ds, begin, end)
+
+    def phase_rows(
+        self, ds: TrajectoryDataset, episode: Ints, begin: Floats, end: Floats
+    ) -> Floats:
+        """Phase at two times of episodes.
+
+        Parameters
+        ----------
+        ds : TrajectoryDataset
+        episode : ndarray of shape (n_rows,)
+        begin, end : ndarray of shape (n_rows,)
+            Absolute times.
+
+        Returns
+        -------
+        ndarray of shape (n_rows, 2)
+
+        Raises
+        ------
+        MissingFieldError
+            If an episode has no `time_origin`.
+        """
+        origin = ds.time_origin[episode]
+        if np.isnan(origin).any():
+            raise MissingFieldError(
+                f"episode {ds.ids[episode[np.isnan(origin)][0]]} has no time_origin, so its "
+                "phase is unknown. Give it, or leave 'phase' out of inputs= and fit again."
+            )
+        return np.stack([begin - origin, end - origin], axis=1)
+
+    def reference_rows(self, ds: TrajectoryDataset, begin: Ints, end: Ints) -> Floats:
+        """References at t, at the knots between, and at t + h.
+
+        Parameters
+        ----------
+        ds : TrajectoryDataset
+        begin, end : ndarray of shape (n_rows,)
+            Rows of ``ds.states``.
+
+        Returns
+        -------
+        ndarray of shape (n_rows, (n_knots + 2) * d_r)
+        """
         if ds.references is None:
             raise MissingFieldError("the episodes have no references, which fit saw.")
-        return np.concatenate([ds.references.take(rows, axis=0) for rows in (begin, end)], axis=1)
+        t, h = ds.times[begin], ds.times[end] - ds.times[begin]
+        between = [
+            interpolate(ds.times, ds.references, begin, end, t + h * (j / (self.n_knots + 1)))
+            for j in range(1, self.n_knots + 1)
+        ]
+        first, last = (ds.references.take(rows, axis=0) for rows in (begin, end))
+        return np.concatenate([first, *between, last], axis=1)
 
     def fit_resample(self, X: Any, y: None = None) -> tuple[Floats, Floats]:
         """Rows and targets of the episodes.
@@ -232,6 +291,7 @@ def has_block(ds: TrajectoryDataset, block: str) -> bool:
     """Whether the episodes can fill a block."""
     return {
         "action": ds.actions is not None,
+        "previous": ds.actions is not None,
         "params": ds.has_params,
         "references": ds.references is not None,
         "context": bool(ds.context),

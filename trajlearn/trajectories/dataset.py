@@ -274,6 +274,12 @@ class TrajectoryDataset(Fields):
 
         return edits.select_states(self, names)
 
+    def assign(self, **fields: Any) -> "TrajectoryDataset":
+        """The same episodes with some fields replaced, such as ``params=`` or ``references=``."""
+        from trajlearn.trajectories import edits
+
+        return edits.assign(self, **fields)
+
     def add_noise(
         self,
         fraction: float,
@@ -318,6 +324,8 @@ class TrajectoryDataset(Fields):
         for field, label in zip(VECTOR_FIELDS, ("d_s", "d_a", "p", "d_r")):
             if self._names[field]:
                 parts.append(f"{label}={len(self._names[field])}")
+        if self.observed is not None:
+            parts.append("observed")
         if self.params_vary:
             parts.append("params vary")
         if self.terminated.any():

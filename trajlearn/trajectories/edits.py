@@ -12,13 +12,14 @@ from sklearn.utils import check_random_state, check_scalar
 
 from trajlearn.exceptions import InvalidEpisodeError
 from trajlearn.trajectories._arrays import unique_ids
-from trajlearn.trajectories._columns import Columns, _offsets, runs
+from trajlearn.trajectories._columns import VECTOR_FIELDS, Columns, _offsets, runs
 from trajlearn.trajectories._pieces import cut, like, pieces
 from trajlearn.trajectories.dataset import TrajectoryDataset
 from trajlearn.trajectories.resampling import decimate, resample
 
 __all__ = [
     "add_noise",
+    "assign",
     "concatenate",
     "decimate",
     "resample",
@@ -100,7 +101,7 @@ def window(ds: TrajectoryDataset, length: int, *, stride: int | None = None) -> 
 
 
 def select_states(ds: TrajectoryDataset, names: Sequence[str]) -> TrajectoryDataset:
-    """Keep the named state columns, in that order.
+    """Keep the named state columns, in that order; `observed` stays as it is.
 
     Parameters
     ----------
@@ -219,6 +220,7 @@ def concatenate(ds: TrajectoryDataset, *others: TrajectoryDataset) -> Trajectory
         "states",
         "times",
         "references",
+        "observed",
         "actions",
         "rewards",
         "terminated",
@@ -242,9 +244,99 @@ def concatenate(ds: TrajectoryDataset, *others: TrajectoryDataset) -> Trajectory
     return like(ds, Columns(**joined))
 
 
+def assign(ds: TrajectoryDataset, **fields: Any) -> TrajectoryDataset:
+    """The same episodes with some fields replaced: other gains, another reference.
+
+    Parameters
+    ----------
+    ds : TrajectoryDataset
+    **fields
+        As in `TrajectoryDataset.from_arrays`, apart from ``states`` and ``dt``: ``actions``,
+        ``rewards``, ``params``, ``references``, ``times``, ``time_origin``, ``context``,
+        ``group``, ``terminated``, ``ids``, and the names of columns. None removes a field.
+        ``params`` of shape (p,) and ``context`` values that are no lists are meant for all
+        episodes. Names stay where the number of columns does.
+
+    Returns
+    -------
+    TrajectoryDataset
+
+    Raises
+    ------
+    TypeError
+        For an unknown field.
+    InvalidEpisodeError
+        Where a new field does not fit the episodes.
+
+    Examples
+    --------
+    What would other gains have done? A model that was fitted with gains can say.
+
+    >>> ds = TrajectoryDataset.from_arrays([[[0.0]] * 4, [[0.0]] * 9], params=[[1.0], [2.0]])
+    >>> assign(ds, params=[5.0]).params
+    array([[5.],
+           [5.]])
+    """
+    unknown = set(fields) - _ASSIGNABLE
+    if unknown:
+        raise TypeError(f"assign got {sorted(unknown)}; it takes {sorted(_ASSIGNABLE)}.")
+    kept: dict[str, Any] = {
+        name: getattr(ds, name) for name in ("time_origin", "context", "group", "terminated", "ids")
+    }
+    for name in ("actions", "rewards", "references", "times"):
+        kept[name] = None if getattr(ds, name) is None else [getattr(e, name) for e in ds]
+    kept["params"] = [e.params for e in ds] if ds.params_vary else ds.params
+    new = dict(fields)
+    params = new.get("params")
+    if params is not None and not _ragged(params) and np.ndim(params) == 1:
+        new["params"] = np.tile(np.asarray(params, dtype=np.float64), (len(ds), 1))
+    for key, values in (new.get("context") or {}).items():
+        if np.ndim(values) == 0:
+            new["context"] = dict(new["context"]) | {key: [values] * len(ds)}
+    names = {key: value for key, value in ds.names.items() if key != "state_names"}
+    for key in list(names):
+        field = f"{key.removesuffix('_names')}s"
+        if field in new and _width(new[field]) != len(names[key]):
+            del names[key]
+    return TrajectoryDataset.from_arrays(
+        [episode.states for episode in ds],
+        state_names=ds.state_names,
+        **{**names, **kept, **new},
+    )
+
+
+_ASSIGNABLE = {
+    "action_names",
+    "actions",
+    "context",
+    "group",
+    "ids",
+    "param_names",
+    "params",
+    "reference_names",
+    "references",
+    "rewards",
+    "terminated",
+    "time_origin",
+    "times",
+}
+
+
+def _ragged(values: Any) -> bool:
+    return isinstance(values, (list, tuple)) and any(np.ndim(item) for item in values)
+
+
+def _width(values: Any) -> int:
+    """Columns of a field by episode, 0 where there is none."""
+    if values is None or not len(values):
+        return 0
+    return int(np.shape(values[0])[-1]) if np.ndim(values[0]) else 0
+
+
 def _fields(ds: TrajectoryDataset) -> dict[str, Any]:
     return {
-        **{f"{field[:-1]}_names": list(names) for field, names in ds._names.items()},
+        **{f"{field[:-1]}_names": list(ds._names[field]) for field in VECTOR_FIELDS},
+        "observed": list(ds.observed_names),
         "rewards": "given" if ds.rewards is not None else "missing",
         "context": {key: _kind(values) for key, values in ds.context.items()},
         "group": None if ds.group is None else _kind(ds.group),

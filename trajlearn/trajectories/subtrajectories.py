@@ -37,8 +37,11 @@ class SubtrajectoryRelabeler(Relabeler):
         Longest horizon in steps.
     inputs : sequence of str or None, default=None
         Blocks of a row, out of ``state, horizon, params, context, references, phase``; None
-        takes every block that the episodes have. `references` holds the values at t and at
-        t + h; `phase` is the time since `time_origin`.
+        takes every block that the episodes have. `references` holds the values at t, at the
+        knots and at t + h; `phase` the time since `time_origin`, at t and at t + h.
+    n_knots : int, default=0
+        Evenly spaced times between t and t + h at which a row holds the references, too. With
+        irregular sampling they are interpolated linearly.
     random_state : int, RandomState, Generator or None, default=None
 
     Attributes
@@ -76,6 +79,7 @@ class SubtrajectoryRelabeler(Relabeler):
         "horizons": [StrOptions({"uniform", "mixture"})],
         "max_horizon": [Interval(Integral, 1, None, closed="left"), None],
         "inputs": ["array-like", None],
+        "n_knots": [Interval(Integral, 0, None, closed="left")],
         "random_state": ["random_state", np.random.Generator],
     }
 
@@ -87,6 +91,7 @@ class SubtrajectoryRelabeler(Relabeler):
         horizons: str = "uniform",
         max_horizon: int | None = None,
         inputs: Sequence[str] | None = None,
+        n_knots: int = 0,
         random_state: Any = None,
     ) -> None:
         self.max_rows = max_rows
@@ -94,6 +99,7 @@ class SubtrajectoryRelabeler(Relabeler):
         self.horizons = horizons
         self.max_horizon = max_horizon
         self.inputs = inputs
+        self.n_knots = n_knots
         self.random_state = random_state
 
     def _resample(

@@ -25,8 +25,10 @@ class TransitionRelabeler(Relabeler):
     inputs : {"action", "params"} or sequence of str, default="action"
         "action": state, action, and the context where there is one. "params": state, params,
         and context and references where there are some. A sequence chooses exactly out of
-        ``state, action, params, dt, context, references``; ``state`` is always in. `dt` is the
-        time step, needed where sampling is mixed; `references` holds the values at t and t + 1.
+        ``state, action, params, dt, previous, context, references``; ``state`` is always in. `dt`
+        is the time step, needed where sampling is mixed; `previous` the action before, a_{t-1}
+        (a_0 itself at the first step), for plants with actuator lag; `references` holds the
+        values at t and t + 1.
     max_rows : int or None, default=None
         Rows to draw without repeats; None takes every step.
     random_state : int, RandomState, Generator or None, default=None
@@ -50,7 +52,7 @@ class TransitionRelabeler(Relabeler):
            [1., 2., 3.]])
     """
 
-    _blocks = ("state", "action", "params", "dt", "context", "references")
+    _blocks = ("state", "action", "params", "dt", "previous", "context", "references")
     _required = ("state",)
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "inputs": [StrOptions({"action", "params"}), "array-like"],
@@ -94,6 +96,11 @@ class TransitionRelabeler(Relabeler):
             If the time step varies and is not an input.
         """
         super().fit(X)
+        if "previous" in self.layout_ and "action" not in self.layout_:
+            raise ValueError(
+                f'inputs={self.inputs!r}: "previous" is the action before, which a roll-out knows '
+                'only where "action" is an input, too.'
+            )
         self.dt_ = None if "dt" in self.layout_ else uniform_step(as_dataset(X))
         return self
 
