@@ -319,12 +319,13 @@ class MeanEpisodeForecaster(CurveForecaster):
         group = of_episode[episode]
         for i in np.unique(group):
             mine = group == i
-            ends = (
-                np.zeros(mine.sum(), dtype=np.intp),
-                np.full(mine.sum(), len(self.phases_[i]) - 1),
-            )
-            states[mine] = interpolate(self.phases_[i], self.means_[i], *ends, phase[mine])
+            states[mine] = self._mean_at(i, phase[mine])
         return states
+
+    def _mean_at(self, group: int, phase: Floats) -> Floats:
+        first = np.zeros(len(phase), dtype=np.intp)
+        last = np.full(len(phase), len(self.phases_[group]) - 1)
+        return interpolate(self.phases_[group], self.means_[group], first, last, phase)
 
     def state_at(self, phase: float, context: Mapping[str, Any] | None = None) -> Floats:
         """Mean state at a phase: a nominal start.
