@@ -48,6 +48,7 @@ _CLASSES = {
             "TransitionRelabeler",
         ),
         "trajlearn.trajectories._layout": ("Layout",),
+        "trajlearn.envs": ("AttitudePD",),
         "trajlearn.policies": ("LinearFeedback", "PID"),
         "sklearn.preprocessing": (
             "FunctionTransformer",

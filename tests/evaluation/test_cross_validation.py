@@ -274,6 +274,23 @@ def test_each_episode_may_have_its_own_start(persistence, make_ramps):
     assert len(forecast.horizons) == 2
 
 
+@pytest.mark.parametrize("ragged", [True, False])
+def test_several_starts_an_episode(decays, ragged):
+    starts = [[0, 10, 15], [3], *[[2, 7]] * 10] if ragged else np.array([[2, 7]] * 12)
+    cv = KFold(3, shuffle=True, random_state=1)
+    forecast = cross_val_forecast(linear_model(), decays, cv, start=starts, horizon=4)
+    assert forecast.episode.tolist() == [i for i, own in enumerate(starts) for _ in own]
+    assert forecast.start.tolist() == [s for own in starts for s in own]
+    for train, test in cv.split(decays):
+        model = linear_model().fit(decays[train])
+        for i in test:
+            own = model.predict(decays[[i]], start=[starts[i]], horizon=4)
+            assert_allclose(forecast[forecast.episode == i].mean, own.mean)
+    errors = horizon_errors(forecast, decays)
+    assert errors.index.names == ["episode", "start"]
+    assert errors.notna().all(axis=None)
+
+
 def test_settings_reach_predict(decays):
     net = MLPEnsembleRegressor(probabilistic=True, hidden_layer_sizes=(16,), max_steps=30)
     model = TrajectoryRegressor(net, random_state=0)
@@ -286,8 +303,8 @@ def test_settings_reach_predict(decays):
     ("arguments", "message"),
     [
         ({"cv": ShuffleSplit(3, random_state=0)}, "exactly one test set"),
-        ({"start": [0, 1]}, r"start has shape \(2,\) for 6 episodes"),
-        ({"start": np.zeros((6, 2), dtype=int)}, r"start has shape \(6, 2\)"),
+        ({"start": [0, 1]}, "start has 2 entries for 6 episodes"),
+        ({"start": np.zeros((2, 6), dtype=int)}, "start has 2 entries for 6 episodes"),
         ({"groups": [1]}, "groups has shape"),
     ],
 )

@@ -22,6 +22,11 @@ class _Streams(NamedTuple):
 
     state: Generator
     params: Generator
+    noise: Generator
+
+    def fresh_noise(self) -> Generator:
+        """The noise of the next flight, whatever the flights before have used up."""
+        return self.noise.spawn(1)[0]
 
 
 class _Episode(NamedTuple):
@@ -124,6 +129,12 @@ class Environment(ABC):
         """
         return lambda rows, states, actions: self._step(states, actions)
 
+    def _disturbed(
+        self, states: NDArray[np.float64], generators: Sequence[Generator]
+    ) -> NDArray[np.float64]:
+        """Add the process noise of one step, row i from the generator of its episode."""
+        return states
+
     def is_terminal(self, states: ArrayLike) -> NDArray[np.bool_]:
         """Whether an episode ends on stepping into ``states`` (..., d_s), shape (...)."""
         return np.zeros(self._checked_states(states).shape[:-1], dtype=bool)
@@ -141,7 +152,7 @@ class Environment(ABC):
         Returns
         -------
         ndarray of shape (n, d_s)
-            The states ``dt`` later.
+            The states ``dt`` later, without process noise.
 
         Raises
         ------
@@ -244,7 +255,8 @@ class Environment(ABC):
         for _ in range(self.max_draws):
             starts = np.stack([self._draw_initial_state(streams[i].state) for i in pending])
             params = np.stack([self._draw_params(streams[i].params) for i in pending])
-            episodes = self._fly_parallel(starts, params, length, policy, pending, n_jobs)
+            noise = [streams[i].fresh_noise() for i in pending]
+            episodes = self._fly_parallel(starts, params, length, policy, pending, noise, n_jobs)
             for i, episode in zip(pending, episodes, strict=True):
                 if not (self.redraw_terminated and episode.terminated):
                     kept[i] = episode
@@ -263,6 +275,8 @@ class Environment(ABC):
         params: ArrayLike | None,
         length: int,
         policy: Policy | None = None,
+        *,
+        random_state: int | RandomState | None = None,
     ) -> TrajectoryDataset:
         """Fly given control parameters from given initial states.
 
@@ -277,6 +291,9 @@ class Environment(ABC):
         policy : callable or None, default=None
             ``policy(states (n, d_s), params (n, p), times (n,)) -> actions (n, d_a)``; None
             takes the system's own. With another policy, p may be any number.
+        random_state : int, RandomState instance or None, default=None
+            Seed of the process noise of systems that have any; with the seed of a ``collect``,
+            the noise of its first draws.
 
         Returns
         -------
@@ -319,8 +336,12 @@ class Environment(ABC):
             )
         _require_finite(theta, "params")
         length = _positive_integer(length, "length")
+        streams = self._episode_streams(len(starts), random_state)
+        noise = [stream.fresh_noise() for stream in streams]
         numbers = range(len(starts))
-        return self._dataset(self._fly(starts, theta, length, policy or self.policy, numbers))
+        return self._dataset(
+            self._fly(starts, theta, length, policy or self.policy, numbers, noise)
+        )
 
     def _fly_parallel(
         self,
@@ -329,6 +350,7 @@ class Environment(ABC):
         length: int,
         policy: Policy,
         numbers: Sequence[int],
+        noise: Sequence[Generator],
         n_jobs: int | None,
     ) -> list[_Episode]:
         """Share the episodes among joblib's workers, a stretch each."""
@@ -336,11 +358,13 @@ class Environment(ABC):
 
         n_workers = min(effective_n_jobs(n_jobs), len(starts))
         if n_workers == 1:
-            return self._fly(starts, params, length, policy, numbers)
+            return self._fly(starts, params, length, policy, numbers, noise)
         edges = np.linspace(0, len(starts), n_workers + 1).astype(int).tolist()
         shares = [slice(a, b) for a, b in pairwise(edges)]
         parts = Parallel(n_jobs=n_jobs)(
-            delayed(self._fly)(starts[part], params[part], length, policy, numbers[part])
+            delayed(self._fly)(
+                starts[part], params[part], length, policy, numbers[part], noise[part]
+            )
             for part in shares
         )
         return [episode for part in parts for episode in part]
@@ -352,10 +376,11 @@ class Environment(ABC):
         length: int,
         policy: Policy,
         numbers: Sequence[int],
+        noise: Sequence[Generator],
     ) -> list[_Episode]:
         """Step all episodes at once, dropping each from the batch when it ends.
 
-        ``numbers`` are the names of the episodes in messages.
+        ``numbers`` are the names of the episodes in messages, ``noise`` their generators.
         """
         n = len(starts)
         states = np.empty((n, length + 1, len(self.state_names)))
@@ -371,6 +396,7 @@ class Environment(ABC):
             applied = self._clipped(wanted, len(flying), f"the policy's actions at step {t}")
             try:
                 current = advance(flying, current, applied)
+                current = self._disturbed(current, [noise[i] for i in flying.tolist()])
                 if not np.isfinite(current).all():
                     row = int(np.argwhere(~np.isfinite(current))[0, 0])
                     raise _SimulationError(row, "left the finite numbers")
@@ -416,7 +442,7 @@ class Environment(ABC):
         n_episodes = _positive_integer(n_episodes, "n_episodes")
         entropy = check_random_state(random_state).randint(2**32, size=4, dtype=np.uint32)
         seeds = np.random.SeedSequence(entropy.tolist()).spawn(n_episodes)
-        return [_Streams(*map(np.random.default_rng, seed.spawn(2))) for seed in seeds]
+        return [_Streams(*map(np.random.default_rng, seed.spawn(3))) for seed in seeds]
 
     def _checked_states(self, states: ArrayLike) -> NDArray[np.float64]:
         s = np.asarray(states, dtype=np.float64)

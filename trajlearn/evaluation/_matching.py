@@ -1,17 +1,30 @@
-"""The logged states that a forecast is to be compared with."""
+"""What a prediction is to be compared with: logged states, or one score an episode."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from trajlearn.dynamics import Forecast
+from trajlearn.dynamics.forecast import shared_states
 from trajlearn.trajectories import TrajectoryDataset, as_dataset
 
-__all__ = ["check_same_times", "episode_of", "with_states_of"]
+__all__ = [
+    "SAME_TIME",
+    "check_same_times",
+    "check_truth_kind",
+    "episode_of",
+    "matched_scores",
+    "with_states_of",
+]
+
+Floats = NDArray[np.float64]
 
 # two samples further apart than this, in mean steps of the episode, are different samples
-_SAME_TIME = 1e-3
+SAME_TIME = 1e-3
+
+_TRUTH_KINDS = ("observed", "true")
 
 
 def episode_of(forecast: Forecast) -> NDArray[np.intp]:
@@ -20,11 +33,18 @@ def episode_of(forecast: Forecast) -> NDArray[np.intp]:
 
 
 def with_states_of(forecast: Forecast, truth: Any) -> TrajectoryDataset:
-    """`truth` with the states that were forecast: a pipeline may have selected some of them."""
+    """`truth` with the logged states that were forecast, in the order of the forecast.
+
+    A pipeline may have selected some states, estimated others that were never logged (these have
+    no column here), or replaced them by smoothed ones (`observed` takes their place).
+    """
     ds = as_dataset(truth)
-    if forecast.state_names != ds.state_names and set(forecast.state_names) <= set(ds.state_names):
-        return ds.select_states(forecast.state_names)
-    return ds
+    _, names, logged = shared_states(forecast.state_names, ds)
+    if ds.observed is None and names == ds.state_names:
+        return ds
+    columns = replace(ds._columns, states=np.ascontiguousarray(logged), observed=None)
+    kept = {field: value for field, value in ds._names.items() if field != "observed"}
+    return TrajectoryDataset._of(columns.freeze(), kept | {"states": names})
 
 
 def check_same_times(forecast: Forecast, truth: TrajectoryDataset) -> None:
@@ -40,7 +60,7 @@ def check_same_times(forecast: Forecast, truth: TrajectoryDataset) -> None:
     steps = forecast.start[:, None] + forecast.horizons
     known = (steps <= (last - first)[:, None]) & np.isfinite(forecast.times)
     logged = truth.times[first[:, None] + np.where(known, steps, 0)]
-    tolerance = _SAME_TIME * (truth.times[last] - truth.times[first]) / (last - first)
+    tolerance = SAME_TIME * (truth.times[last] - truth.times[first]) / (last - first)
     late = np.abs(np.where(known, forecast.times - logged, 0.0))
     if (late > tolerance[:, None]).any():
         i, j = np.argwhere(late > tolerance[:, None])[0]
@@ -49,3 +69,31 @@ def check_same_times(forecast: Forecast, truth: TrajectoryDataset) -> None:
             f"{forecast.horizons[j]}, but episode {truth.ids[episode[i]]} was logged at "
             f"{logged[i, j]:g}: give the episodes that were forecast, in their order and sampling."
         )
+
+
+def check_truth_kind(truth_kind: str) -> None:
+    """Refuse a word that does not say what the true states are."""
+    if truth_kind not in _TRUTH_KINDS:
+        raise ValueError(f'truth_kind = {truth_kind!r}; choose "observed" or "true".')
+
+
+def matched_scores(predicted: ArrayLike, true: ArrayLike, what: str) -> tuple[Floats, Floats]:
+    """Both as (n,) arrays; a prediction may be infinite, a true score may not.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are not the same (n,), or a value is NaN or a true one infinite.
+    """
+    guess, target = (np.asarray(values, dtype=np.float64) for values in (predicted, true))
+    if guess.ndim != 1 or guess.shape != target.shape or not len(guess):
+        raise ValueError(
+            f"predicted has shape {guess.shape}, true {target.shape}: give one {what} an episode, "
+            "both of shape (n,); a column (n, 1) needs .ravel()."
+        )
+    if np.isnan(guess).any() or not np.isfinite(target).all():
+        raise ValueError(
+            f"predicted has NaN, or true has NaN or infinite values; a forecast that diverged has "
+            f"an infinite {what}, and every episode needs a true {what}."
+        )
+    return guess, target

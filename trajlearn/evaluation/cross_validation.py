@@ -1,7 +1,7 @@
 """Cross-validation over episodes and horizons."""
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from trajlearn.dynamics import Forecast
 from trajlearn.evaluation._horizons import errors_at, predicted_states, whole_steps
+from trajlearn.evaluation._matching import episode_of
 from trajlearn.evaluation.errors import summarise
 from trajlearn.regressors._threads import threads_for
 from trajlearn.trajectories import TrajectoryDataset, as_dataset
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 __all__ = ["cross_val_forecast", "cross_validate_horizons"]
 
+Starts = ArrayLike | Sequence[ArrayLike]
 Fold = tuple[NDArray[np.intp], NDArray[np.intp]]
 
 
@@ -137,7 +139,7 @@ def cross_val_forecast(
     groups: ArrayLike | None = None,
     n_jobs: int | None = None,
     verbose: int = 0,
-    start: ArrayLike = 0,
+    start: Starts = 0,
     **settings: Any,
 ) -> Forecast:
     """Forecast of each episode by a model that was not fitted on it.
@@ -149,15 +151,17 @@ def cross_val_forecast(
     ds : TrajectoryDataset or list of Trajectory
     cv, groups, n_jobs, verbose
         As in `cross_validate_horizons`; each episode must be in exactly one test set.
-    start : int or array-like of shape (n,), default=0
-        Index of the state to begin at: one, or one per episode.
+    start : int, array-like of shape (n,) or (n, k), or n arrays, default=0
+        Index of the state to begin at: one, one per episode, or several per episode, as from
+        `starts_every`.
     **settings
         Further arguments of `predict`, such as ``horizon=``, ``return_std=True``, ``n_samples=``.
 
     Returns
     -------
     Forecast
-        In the order of `ds`. Its `state_range` spans the training states of all folds, whereas
+        In the order of `ds`; with several starts per episode its `episode` tells them apart.
+        Its `state_range` spans the training states of all folds, whereas
         `cross_validate_horizons` scales the errors of each fold by the fold's own.
 
     Raises
@@ -186,15 +190,18 @@ def cross_val_forecast(
             "cross_val_forecast needs every episode in exactly one test set; use a splitter such "
             "as KFold or GroupKFold."
         )
-    starts = np.asarray(start)
-    if starts.shape not in ((), (len(ds),)):
+    starts: list[Any] = list(start) if np.iterable(start) else [start] * len(ds)
+    if len(starts) != len(ds):
         raise ValueError(
-            f"start has shape {starts.shape} for {len(ds)} episodes: give one index, or one per "
-            "episode."
+            f"start has {len(starts)} entries for {len(ds)} episodes: give one index, one per "
+            "episode, or an array of several per episode."
         )
-    starts = np.broadcast_to(starts, len(ds))
     forecasts = _map_folds(_fold_forecast, estimator, ds, folds, n_jobs, verbose, starts, settings)
-    return np.concatenate(forecasts)[np.argsort(order)]  # type: ignore[return-value]
+    episode = np.concatenate([test[episode_of(f)] for f, (_, test) in zip(forecasts, folds)])
+    several = any(f.episode is not None for f in forecasts)
+    joined: Any = np.concatenate([f._replace(episode=None) for f in forecasts])
+    in_order = np.argsort(episode, kind="stable")
+    return joined._replace(episode=episode if several else None)[in_order]
 
 
 # -- one fold -----------------------------------------------------------------------------
@@ -211,11 +218,12 @@ def _fold_forecast(
     estimator: Any,
     ds: TrajectoryDataset,
     fold: Fold,
-    starts: NDArray[np.intp],
+    starts: list[Any],
     settings: dict[str, Any],
 ) -> Forecast:
     train, test = fold
-    return predicted_states(estimator.fit(ds[train]), ds[test], start=starts[test], **settings)
+    start = [starts[i] for i in test]
+    return predicted_states(estimator.fit(ds[train]), ds[test], start=start, **settings)
 
 
 # -- all folds ----------------------------------------------------------------------------

@@ -3,20 +3,23 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from trajlearn.dynamics import Forecast
-from trajlearn.evaluation._matching import check_same_times, episode_of, with_states_of
+from trajlearn.evaluation._matching import (
+    check_same_times,
+    check_truth_kind,
+    episode_of,
+    matched_scores,
+    with_states_of,
+)
+from trajlearn.evaluation._statistics import mean, quantile
 from trajlearn.trajectories import TrajectoryDataset
 
 if TYPE_CHECKING:
     import pandas as pd
 
 __all__ = ["horizon_errors", "reward_errors", "summarise"]
-
-Floats = NDArray[np.float64]
-
-_TRUTH_KINDS = ("observed", "true")
 
 
 def horizon_errors(
@@ -71,8 +74,7 @@ def horizon_errors(
     """
     import pandas as pd
 
-    if truth_kind not in _TRUTH_KINDS:
-        raise ValueError(f'truth_kind = {truth_kind!r}; choose "observed" or "true".')
+    check_truth_kind(truth_kind)
     ds = with_states_of(forecast, truth)
     errors = forecast.squared_errors(ds).mean(axis=2)
     check_same_times(forecast, ds)
@@ -101,7 +103,8 @@ def summarise(errors: "pd.DataFrame") -> "pd.DataFrame":
     DataFrame of shape (H, 6)
         Index ``horizon``; columns ``n_episodes`` (that reach the horizon), ``n_diverged``
         (episodes with a forecast that has diverged by then), ``median``, ``mean``, ``q65``,
-        ``q95``. Where episodes have several starts the statistics are over all forecasts.
+        ``q95``. Where episodes have several starts the statistics are over all forecasts; for
+        those over episodes pass ``errors.groupby(level="episode", sort=False).mean()``.
 
     Examples
     --------
@@ -120,16 +123,14 @@ def summarise(errors: "pd.DataFrame") -> "pd.DataFrame":
     if isinstance(errors.index, pd.MultiIndex):
         present = present.groupby(level="episode").any()
         diverged = diverged.groupby(level="episode").any()
-    count = (~np.isnan(values)).sum(axis=0)
-    total = np.where(np.isnan(values), 0.0, values).sum(axis=0)
     table = pd.DataFrame(
         {
             "n_episodes": present.to_numpy().sum(axis=0),
             "n_diverged": diverged.to_numpy().sum(axis=0),
-            "median": _quantile(values, 0.5),
-            "mean": np.where(count > 0, total / np.maximum(count, 1), np.nan),
-            "q65": _quantile(values, 0.65),
-            "q95": _quantile(values, 0.95),
+            "median": quantile(values, 0.5),
+            "mean": mean(values),
+            "q65": quantile(values, 0.65),
+            "q95": quantile(values, 0.95),
         },
         index=pd.Index(errors.columns, name="horizon"),
     )
@@ -166,36 +167,13 @@ def reward_errors(predicted: ArrayLike, true: ArrayLike) -> dict[str, float]:
     >>> errors["median"], round(errors["mean"], 3), errors["n_diverged"]
     (0.0, 0.333, 0)
     """
-    guess, target = (np.asarray(values, dtype=np.float64) for values in (predicted, true))
-    if guess.ndim != 1 or guess.shape != target.shape or not len(guess):
-        raise ValueError(
-            f"predicted has shape {guess.shape}, true {target.shape}: give one reward an episode, "
-            "both of shape (n,); a column (n, 1) needs .ravel()."
-        )
-    if np.isnan(guess).any() or not np.isfinite(target).all():
-        raise ValueError(
-            "predicted has NaN, or true has NaN or infinite values; a forecast that diverged has "
-            "the reward -inf, and every episode needs a true reward."
-        )
+    guess, target = matched_scores(predicted, true, "reward")
     squared = (guess - target) ** 2
     n_diverged = int(np.isinf(guess).sum())
     return {
         "mean": float(squared.mean()),
         "std": float("inf") if n_diverged else float(squared.std()),
-        "median": float(_quantile(squared[:, None], 0.5)[0]),
+        "median": float(quantile(squared[:, None], 0.5)[0]),
         "n_episodes": len(squared),
         "n_diverged": n_diverged,
     }
-
-
-def _quantile(values: Floats, q: float) -> Floats:
-    """Linear quantile of each column; NaN is absent, +inf an ordinary (largest) value."""
-    ordered = np.sort(values, axis=0)  # NaN last, after inf
-    count = (~np.isnan(values)).sum(axis=0)
-    position = q * np.maximum(count - 1, 0)
-    below = np.floor(position).astype(np.intp)
-    weight = position - below
-    low = np.take_along_axis(ordered, below[None], axis=0)[0]
-    high = np.take_along_axis(ordered, (below + (weight > 0))[None], axis=0)[0]
-    with np.errstate(invalid="ignore"):
-        return np.where(np.isfinite(high), low + weight * (high - low), high)
