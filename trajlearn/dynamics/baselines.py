@@ -117,6 +117,17 @@ class CurveForecaster(EpisodeForecaster):
     """Base of forecasters that say where an episode is at a time, whatever the start state.
 
     A subclass defines ``at(ds, episode, times)`` and, if it learns, ``_learn(ds)``.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from trajlearn import CurveForecaster, TrajectoryDataset
+    >>> class Ramp(CurveForecaster):
+    ...     def at(self, ds, episode, times):
+    ...         return ds.params[episode] * times[:, None]
+    >>> ds = TrajectoryDataset.from_arrays(np.zeros((1, 4, 1)), params=[[2.0]])
+    >>> Ramp().fit(ds).predict(ds).mean[0, :, 0]
+    array([2., 4., 6.])
     """
 
     @abstractmethod
