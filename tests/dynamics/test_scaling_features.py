@@ -17,6 +17,7 @@ from trajlearn import (
     LSTMRegressor,
     OneStepRegressor,
     SubtrajectoryRelabeler,
+    TrajectoryDataset,
     TrajectoryRegressor,
 )
 from trajlearn.exceptions import HorizonWarning
@@ -194,3 +195,28 @@ def test_features_that_fail_at_prediction_are_named():
         warnings.simplefilter("ignore", HorizonWarning)
         with pytest.raises(ValueError, match="features=root returned NaN"):
             model.predict(linear(8, scale=30.0))
+
+
+def reciprocal(states, params):
+    return 1 / states[:, :1]
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        OneStepRegressor(inputs="params", random_state=0).set_params(**SMALL),
+        LSTMRegressor(inputs="params", max_steps=3, random_state=0),
+    ],
+    ids=["one step", "recurrent"],
+)
+def test_features_are_asked_for_at_states_of_episodes_only(model):
+    """A feature that is singular at zero, where no episode is: nor may a made-up row be."""
+    ds = closed_loop(8)
+    moved = ds.states + 5 - ds.states.min()
+    ds = TrajectoryDataset.from_arrays(
+        np.split(moved, ds.offsets[1:-1]), params=[episode.params for episode in ds]
+    )
+    model.set_params(scaler__features=reciprocal).fit(ds)
+    starts = np.arange(len(ds)) % 3
+    forecast = model.predict(ds, start=starts, horizon=2, return_std=True)
+    assert np.isfinite(forecast.std).all()

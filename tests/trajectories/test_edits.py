@@ -439,3 +439,67 @@ def test_datasets_of_different_fields_are_not_joined(fields, match):
         ds.concatenate(ds, other)
     with pytest.raises(TypeError, match="joins datasets, got Trajectory"):
         ds.concatenate(ds[0])
+
+
+# -- assign -------------------------------------------------------------------------------
+
+
+def full():
+    rng = np.random.default_rng(0)
+    return TrajectoryDataset.from_arrays(
+        [rng.normal(size=(t + 1, 2)) for t in (3, 5)],
+        actions=[rng.normal(size=(t, 1)) for t in (3, 5)],
+        rewards=[rng.normal(size=t) for t in (3, 5)],
+        references=[rng.normal(size=(t + 1, 1)) for t in (3, 5)],
+        params=[[1.0, 2.0], [3.0, 4.0]],
+        times=[np.arange(4.0) + 7, np.arange(6.0) ** 2],
+        time_origin=[7.5, np.nan],
+        context={"kind": ["a", "b"]},
+        group=["x", "y"],
+        terminated=[True, False],
+        ids=["one", "two"],
+        state_names=["p", "v"],
+        param_names=["kp", "kd"],
+        reference_names=["set"],
+    )
+
+
+def test_assign_replaces_what_is_named_and_nothing_else():
+    ds = full()
+    assert ds.assign() == ds
+    other = ds.assign(params=[9.0, 8.0])
+    np.testing.assert_array_equal(other.params, [[9.0, 8.0]] * 2)
+    assert other.param_names == ("kp", "kd")
+    assert other.assign(params=ds.params) == ds
+    ramp = [np.arange(4.0)[:, None], np.arange(6.0)[:, None]]
+    np.testing.assert_array_equal(ds.assign(references=ramp)[1].references, ramp[1])
+    assert ds.assign(references=ramp).reference_names == ("set",)
+
+
+def test_assign_renames_where_the_width_changes_and_removes_on_none():
+    ds = full()
+    assert ds.assign(params=[[1.0], [2.0]]).param_names == ("theta0",)
+    assert ds.assign(params=[[1.0], [2.0]], param_names=["k"]).param_names == ("k",)
+    bare = ds.assign(params=None, references=None, actions=None, group=None, context=None)
+    assert not bare.has_params
+    assert bare.references is None
+    assert bare.actions is None
+    assert bare.context == {}
+    np.testing.assert_array_equal(bare.states, ds.states)
+
+
+def test_assign_keeps_theta_by_step_and_takes_one_context_for_all():
+    ds = full().assign(params=[np.arange(6.0).reshape(3, 2), np.arange(10.0).reshape(5, 2)])
+    assert ds.params_vary
+    assert ds.assign(group=["u", "v"]).params_vary
+    assert ds.assign(context={"kind": "c"}).context["kind"].tolist() == ["c", "c"]
+
+
+def test_assign_refuses_what_does_not_fit():
+    ds = full()
+    with pytest.raises(TypeError, match="states"):
+        ds.assign(states=np.zeros((2, 4, 2)))
+    with pytest.raises(InvalidEpisodeError, match="references"):
+        ds.assign(references=np.zeros((2, 3, 1)))
+    with pytest.raises(InvalidEpisodeError):
+        ds.assign(params=[[1.0, np.nan], [1.0, 1.0]])

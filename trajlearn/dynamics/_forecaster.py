@@ -87,11 +87,13 @@ class Forecaster(BaseEstimator):
         Parameters
         ----------
         X : TrajectoryDataset or list of Trajectory
-        start : int, array-like of shape (n,) or (n, k), default=0
-            Index of the state to begin at: one, one per episode, or several per episode.
+        start : int, array-like of shape (n,) or (n, k), or list of n arrays, default=0
+            Index of the state to begin at: one, one per episode, or several per episode, as many
+            in each or not.
         horizon : int or None, default=None
             Steps to predict; None goes to the end of each episode. With known times ahead a
-            forecast may go past the log, unless it needs logged signals there.
+            forecast may go past the log; one that needs logged signals there, such as references,
+            ends with it.
         actions : {"auto", "logged", "policy"}, default="auto"
             Where a roll-out takes its actions from; models without actions ignore it.
         policy : callable, optional

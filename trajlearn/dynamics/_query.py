@@ -99,7 +99,7 @@ def make_query(
     Parameters
     ----------
     ds : TrajectoryDataset
-    start : int, (n,) or (n, k)
+    start : int, (n,), (n, k) or n arrays
         An index, one per episode, or several per episode.
     horizon : int or None
         None forecasts to the end of each episode.
