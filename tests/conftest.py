@@ -80,7 +80,9 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
         report
         for several in terminalreporter.stats.values()
         for report in several
-        if _NEEDS_DATA in map(tuple, getattr(report, "user_properties", ()))
+        # items that were deselected stand there, too
+        if isinstance(report, pytest.TestReport)
+        and _NEEDS_DATA in map(tuple, getattr(report, "user_properties", ()))
     ]
     skipped = {report.nodeid for report in reports if report.skipped}
     ran = {report.nodeid for report in reports} - skipped

@@ -9,6 +9,7 @@ __all__ = [
     "InvalidEpisodeError",
     "MissingFieldError",
     "MixedSamplingError",
+    "SmoothingWarning",
     "UnknownFileError",
 ]
 
@@ -35,3 +36,7 @@ class DivergenceWarning(UserWarning):
 
 class HorizonWarning(UserWarning):
     """A forecast reaches beyond the longest horizon seen in training."""
+
+
+class SmoothingWarning(UserWarning):
+    """A Kalman smoother met states that it cannot improve."""

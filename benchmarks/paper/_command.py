@@ -6,6 +6,7 @@ JSON file with the provenance, so that text and figures can be made again withou
 """
 
 import argparse
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from io import BytesIO
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RESULTS = Path(__file__).parent / "results"
+# environment variable: worker processes inherit it, and the files of cells do not name it
+_DATA = "TRAJLEARN_FLIGHTS"
 
 Tables = dict[str, pd.DataFrame]
 
@@ -45,6 +48,8 @@ class Run:
         Whether to forget the cells of earlier runs.
     task : str, optional
         The one to run, of a benchmark with a result for each task.
+    data : Path, optional
+        Folder of the folders of recorded data. Cells find them by `data_folder`.
     """
 
     name: str
@@ -55,6 +60,7 @@ class Run:
     workers: dict[str, Any]
     fresh: bool = False
     task: str | None = None
+    data: Path | None = None
 
     @property
     def folder(self) -> Path:
@@ -107,6 +113,8 @@ class Benchmark:
     tasks : tuple of str
         Each has a result of its own, in files named after the task; ``--task`` chooses one.
         `run` finds it in ``run.task``, and `settings` gives a dict for each of them.
+    data : tuple of str
+        Folders of recorded data that it reads, inside the one that ``--data`` names.
     """
 
     name: str
@@ -119,6 +127,7 @@ class Benchmark:
     seeds: int = 3
     publish: Path | None = None
     tasks: tuple[str, ...] = ()
+    data: tuple[str, ...] = ()
 
     def main(self, arguments: list[str] | None = None) -> None:
         """Run from the command line."""
@@ -134,7 +143,8 @@ class Benchmark:
         folder = root / self.name
         seeds = list(range(1 if options.quick else options.seeds))
         workers = {"scheduler": options.scheduler, "local_workers": options.local_workers}
-        whole = Run(self.name, mode, seeds, root, options.n_jobs, workers, options.fresh)
+        data = self._data(parser, options.data) if self.data else None
+        whole = Run(self.name, mode, seeds, root, options.n_jobs, workers, options.fresh, data=data)
         tasks = [options.task] if self.tasks and options.task else self.tasks or [None]
         for run in [replace(whole, task=task) for task in tasks]:
             if not options.redraw:
@@ -145,6 +155,15 @@ class Benchmark:
                 "This was the quick mode: one seed, short training. The full run, about "
                 f"{self.minutes} minutes on two cores: .venv/bin/trajlearn reproduce {self.name}"
             )
+
+    def _data(self, parser: argparse.ArgumentParser, folder: Path | None) -> Path | None:
+        """The folder of recorded data, told to the workers as well."""
+        if folder is not None:
+            missing = [name for name in self.data if not (folder / name).is_dir()]
+            if missing:
+                parser.error(f"--data {folder} has no folder {' and no folder '.join(missing)}.")
+            os.environ[_DATA] = str(folder.resolve())
+        return Path(os.environ[_DATA]) if os.environ.get(_DATA) else None
 
     def _store(self, run: Run, folder: Path) -> None:
         """Run, and write the tables and what a reader must know of them."""
@@ -184,6 +203,15 @@ class Benchmark:
         add = parser.add_argument
         if self.tasks:
             add("--task", choices=self.tasks, help="(default: all)")
+        if self.data:
+            add(
+                "--data",
+                type=Path,
+                metavar="FOLDER",
+                help=f"holds {', '.join(self.data)} (default: that of the environment variable "
+                f"{_DATA}, which workers on other machines need; else what is missing is "
+                "downloaded)",
+            )
         add("--quick", action="store_true", help="one seed, short training: minutes")
         add("--seeds", type=_positive, default=self.seeds, help="(default: %(default)s)")
         add("--n-jobs", type=int, default=2, help="processes (default: %(default)s)")
@@ -200,6 +228,12 @@ class Benchmark:
         add("--fresh", action="store_true", help="forget the cells of earlier runs")
         add("--redraw", action="store_true", help="text and figures from the stored results")
         return parser
+
+
+def data_folder(name: str) -> Path | None:
+    """Folder of recorded data by its name, in any worker; None lets a loader download it."""
+    folder = os.environ.get(_DATA)
+    return Path(folder) / name if folder else None
 
 
 def _save_png(figure: "Figure", path: Path) -> None:

@@ -1,5 +1,6 @@
 """Looks that the figures of this folder share: readable in grey, log errors, axes with units."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -38,6 +39,15 @@ def draw_curve(
         ax.fill_between(horizon, low, high, color=style["color"], alpha=0.13, lw=0)
 
 
+def draw_percentiles(ax: "Axes", curve: pd.DataFrame, i: int, label: str) -> None:
+    """One line, shaded up to the 65th and 95th percentile; of each the median over seeds."""
+    over = over_seeds(curve, ["horizon"])
+    for q in ("q65", "q95"):
+        over[q] = over_seeds(curve, ["horizon"], q)["middle"]
+    draw_curve(ax, over, i, label, band=("middle", "q65"))
+    draw_curve(ax, over, i, "", band=("middle", "q95"))
+
+
 def horizon_axes(ax: "Axes", *, title: str, length: int | None = None, unit: str = "steps") -> None:
     """Logarithmic in the error, with the training length marked."""
     ax.set_yscale("log", nonpositive="mask")
@@ -52,11 +62,19 @@ def horizon_axes(ax: "Axes", *, title: str, length: int | None = None, unit: str
     tidy(ax)
 
 
-def legend_below(figure: Any, ax: "Axes", ncols: int) -> None:
-    """One legend for all panels, under them."""
-    handles, labels = ax.get_legend_handles_labels()
+def legend_below(figure: Any, ax: "Axes", ncols: int, *, others: Sequence["Axes"] = ()) -> None:
+    """One legend for all panels, under them: the lines of `ax`, and what `others` have more."""
+    named: dict[str, Any] = {}
+    for some in (ax, *others):
+        for handle, label in zip(*some.get_legend_handles_labels(), strict=True):
+            named.setdefault(label, handle)
     figure.legend(
-        handles, labels, loc="outside lower center", ncols=ncols, frameon=False, handlelength=3.2
+        named.values(),
+        named.keys(),
+        loc="outside lower center",
+        ncols=ncols,
+        frameon=False,
+        handlelength=3.2,
     )
 
 

@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 
 from benchmarks.paper._command import Run
 from benchmarks.paper._models import build, label
-from benchmarks.paper._tasks import N_EPISODES, TASKS, environment, episodes
+from benchmarks.paper._tasks import N_EPISODES, environment, episodes, shape
 from trajlearn import TrajectoryDataset, horizon_errors, summarise
 from trajlearn.exceptions import DivergenceWarning, HorizonWarning
 
 #: Test episodes, full and quick.
 N_TEST = {"full": N_EPISODES, "quick": 20}
+#: Times the error of T that the paper prints for the others, with logged actions, beyond 50 steps.
+PRINTED_GAIN = (5, 10)
 _CURVE = ["median", "mean", "q65", "q95", "n_diverged"]
 
 
@@ -65,7 +67,7 @@ def assess(
         ``reward`` (predicted minus true, by episode), ``seconds``.
     """
     began = time.perf_counter()
-    with _expected():
+    with expected_warnings():
         predicted = model.predict(test, **forecast)
     seconds = time.perf_counter() - began
     errors = horizon_errors(predicted, test, truth_kind="true")
@@ -83,7 +85,7 @@ def assess(
     }
     if reward is not None:
         first = test.truncate(length)
-        with _expected():
+        with expected_warnings():
             guess = model.predict_reward(first, reward, **forecast)
         truth = np.array([reward(episode.states[1:]).mean() for episode in first])
         result["reward"] = (guess - truth).tolist()
@@ -91,7 +93,7 @@ def assess(
 
 
 @contextmanager
-def _expected() -> Iterator[None]:
+def expected_warnings() -> Iterator[None]:
     """No warnings of what the tables report: divergence, and horizons beyond training."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DivergenceWarning)
@@ -107,7 +109,7 @@ def action_sources(model: str) -> list[str]:
 
 def cell(task: str, model: str, settings: str, mode: str, seed: int) -> dict[str, Any]:
     """Fit one model on one seed, and assess it with every source of actions."""
-    env, (length, test_length) = environment(task), TASKS[task]
+    env, (length, test_length) = environment(task), shape(task)
     train, test = episodes(task, seed, n_test=N_TEST[mode], test_length=test_length)
     estimator = build(model, settings, policy=env.policy, mode=mode, seed=seed)
     began = time.perf_counter()

@@ -1,8 +1,10 @@
 """The paper's simulated tasks: systems, lengths, and episodes whose seeds never meet."""
 
+from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
-from trajlearn import Cartpole, Reacher, TrajectoryDataset
+from trajlearn import Cartpole, Quadrotor, Reacher, TrajectoryDataset
 from trajlearn.envs.base import Environment
 
 N_EPISODES = 100
@@ -15,12 +17,26 @@ class Task(NamedTuple):
     test_length: int
 
 
+#: Tasks of every benchmark.
 TASKS = {"cartpole": Task(200, 400), "reacher": Task(500, 1000)}
+#: The task with process noise, of the benchmark of errors by horizon alone.
+QUADROTOR = {"quadrotor-sim": Task(500, 1000)}
+# like the paper's code, cartpole and quadrotor draw episodes that end early again
+_ENVIRONMENTS: dict[str, Callable[[], Environment]] = {
+    "cartpole": partial(Cartpole, redraw_terminated=True),
+    "reacher": Reacher,
+    "quadrotor-sim": partial(Quadrotor, redraw_terminated=True),
+}
+
+
+def shape(task: str) -> Task:
+    """Lengths of a task, by name."""
+    return (TASKS | QUADROTOR)[task]
 
 
 def environment(task: str) -> Environment:
-    """The simulator of a task; like the paper, cartpole redraws episodes that end early."""
-    return Cartpole(redraw_terminated=True) if task == "cartpole" else Reacher()
+    """The simulator of a task."""
+    return _ENVIRONMENTS[task]()
 
 
 def episodes(
@@ -30,6 +46,6 @@ def episodes(
 
     The test episodes are as long as the training episodes, or as `test_length` says.
     """
-    env, length = environment(task), TASKS[task].length
+    env, length = environment(task), shape(task).length
     train = env.collect(N_EPISODES, length, random_state=2 * seed)
     return train, env.collect(n_test, test_length or length, random_state=2 * seed + 1)

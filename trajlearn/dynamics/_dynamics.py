@@ -66,7 +66,7 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
         self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
     ) -> None:
         # a model of one step knows no longest horizon; the others set it
-        self._learn_ranges(ds.states, ds.state_names, np.inf)
+        self._learn_ranges_of(ds)
         self.baseline_, states = fit_baseline(self.baseline, ds, weight, groups, self._rng)
         if states is not None:
             ds = relative_to(self.baseline_, ds, states)

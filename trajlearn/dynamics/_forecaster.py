@@ -67,6 +67,15 @@ class Forecaster(BaseEstimator):
         self.state_names_ = names
         self.max_horizon_ = longest
 
+    def _learn_ranges_of(self, ds: TrajectoryDataset) -> None:
+        """Ranges of what was measured: errors behind a smoother and without it are comparable."""
+        self._learn_ranges(ds.states, ds.state_names, np.inf)
+        if ds.observed is not None:
+            for i, name in enumerate(ds.state_names):
+                if name in ds.observed_names:
+                    measured = ds.observed[:, ds.observed_names.index(name)]
+                    self.state_range_[:, i] = measured.min(), measured.max()
+
     def forecast(
         self,
         X: Any,

@@ -43,7 +43,7 @@ class EpisodeForecaster(SaveMixin, Forecaster):
         self
         """
         ds = as_dataset(X)
-        self._learn_ranges(ds.states, ds.state_names, np.inf)
+        self._learn_ranges_of(ds)
         self._learn(ds)
         return self
 

@@ -16,7 +16,7 @@ from trajlearn.exceptions import InvalidEpisodeError
 
 Floats = NDArray[np.float64]
 
-STATE_FIELDS = ("states", "times", "references")
+STATE_FIELDS = ("states", "times", "references", "observed")
 STEP_FIELDS = ("actions", "rewards")
 EPISODE_FIELDS = ("terminated", "time_origin", "ids", "group")
 VECTOR_FIELDS = ("states", "actions", "params", "references")
@@ -26,7 +26,8 @@ VECTOR_FIELDS = ("states", "actions", "params", "references")
 class Columns:
     """All fields of all episodes; absent ones are None.
 
-    ``params`` has one row an episode, or one a step where `params_per_step` is true.
+    ``params`` has one row an episode, or one a step where `params_per_step` is true. ``observed``
+    are the states as logged, where a transformer replaced them by estimates.
     """
 
     offsets: NDArray[np.intp]
@@ -39,6 +40,7 @@ class Columns:
     rewards: Floats | None = None
     params: Floats | None = None
     references: Floats | None = None
+    observed: Floats | None = None
     group: NDArray[Any] | None = None
     context: dict[str, NDArray[Any]] = field(default_factory=dict)
     params_per_step: bool = False
@@ -314,7 +316,7 @@ def _check_values(columns: Columns, labels: Sequence[Any]) -> None:
             f"{after} at row {row - columns.offsets[episode]}. Sort the rows by time and drop "
             "repeated ones."
         )
-    for name in ("states", *STEP_FIELDS, "params", "references"):
+    for name in ("states", *STEP_FIELDS, "params", "references", "observed"):
         _check_finite(name, columns, labels)
     if np.isinf(columns.time_origin).any():
         episode = int(np.flatnonzero(np.isinf(columns.time_origin))[0])

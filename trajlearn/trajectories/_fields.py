@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from trajlearn.exceptions import MissingFieldError
-from trajlearn.trajectories._columns import Columns
+from trajlearn.trajectories._columns import VECTOR_FIELDS, Columns
 
 __all__ = ["Fields"]
 
@@ -54,6 +54,14 @@ class Fields:
     def references(self) -> NDArray[np.float64] | None:
         """All references (sum of T + 1, d_r), or None."""
         return self._columns.references
+
+    @property
+    def observed(self) -> NDArray[np.float64] | None:
+        """States as logged (sum of T + 1, d_o) where a transformer estimated `states`, or None.
+
+        Scores compare forecasts with these.
+        """
+        return self._columns.observed
 
     @property
     def has_params(self) -> bool:
@@ -151,9 +159,15 @@ class Fields:
         return self._names["references"]
 
     @property
+    def observed_names(self) -> tuple[str, ...]:
+        """Names of the columns of `observed`."""
+        return self._names.get("observed", ())
+
+    @property
     def names(self) -> dict[str, tuple[str, ...]]:
-        """All names, as keyword arguments of the constructors."""
-        return {f"{field[:-1]}_names": names for field, names in self._names.items() if names}
+        """All names that the constructors take, as their keyword arguments."""
+        given = {field: names for field, names in self._names.items() if field in VECTOR_FIELDS}
+        return {f"{field[:-1]}_names": names for field, names in given.items() if names}
 
     def state_rows(self, start: ArrayLike = 0) -> NDArray[np.intp]:
         """Row in `states` of the state `start` of each episode (n,).

@@ -34,6 +34,7 @@ def assemble(
     params: ArrayLike | None = None,
     params_per_step: bool = False,
     references: ArrayLike | None = None,
+    observed: ArrayLike | None = None,
     group: Sequence[Any] | None = None,
     context: Mapping[str, Sequence[Any]] | None = None,
 ) -> TrajectoryDataset:
@@ -45,7 +46,7 @@ def assemble(
         States in each episode.
     ids : sequence of n labels
     names : mapping from field to column names
-    states, times, references : array-like with one row a state
+    states, times, references, observed : array-like with one row a state
     actions, rewards : array-like with one row a step
     params : array-like with one row a step if `params_per_step`, else one an episode
     terminated, time_origin, group, context : one value an episode
@@ -70,6 +71,7 @@ def assemble(
         ("states", states, 2, n_states),
         ("times", times, 1, n_states),
         ("references", references, 2, n_states),
+        ("observed", observed, 2, n_states),
         ("actions", actions, 2, n_steps),
         ("rewards", rewards, 1, n_steps),
         ("params", params, 2, n_steps if params_per_step else n),
@@ -101,4 +103,12 @@ def assemble(
         raise InvalidEpisodeError(f"group has {len(columns.group)} values for {n} episodes.")
     _check_values(columns, ids)
     columns = columns.canonical().freeze()
-    return TrajectoryDataset._of(columns, check_names(columns, *map(names.get, VECTOR_FIELDS)))
+    checked = check_names(columns, *map(names.get, VECTOR_FIELDS))
+    if columns.observed is not None:
+        checked["observed"] = tuple(str(name) for name in names.get("observed") or ())
+        if len(set(checked["observed"])) != columns.observed.shape[1]:
+            raise InvalidEpisodeError(
+                f"observed has {columns.observed.shape[1]} columns, but the names "
+                f"{list(checked['observed'])}."
+            )
+    return TrajectoryDataset._of(columns, checked)

@@ -255,6 +255,7 @@ def _read_parquet(handle: IO[bytes]) -> TrajectoryDataset:
         params=stacked("params", is_step if per_step else starts),
         params_per_step=per_step,
         references=stacked("references", every),
+        observed=stacked("observed", every),
         group=by_episode("group", None),
         context={
             key: values(column)[starts].tolist()

@@ -145,6 +145,7 @@ def column_labels(ds: TrajectoryDataset) -> dict[str, list[str]]:
         "rewards": ["reward"] if ds.rewards is not None else [],
         "params": list(ds.param_names),
         "references": list(ds.reference_names),
+        "observed": [f"observed_{name}" for name in ds.observed_names],
         "context": list(ds.context),
         "group": ["group"] if ds.group is not None else [],
         "terminated": ["terminated"] if ds.terminated.any() else [],
@@ -164,10 +165,11 @@ def to_frame(ds: TrajectoryDataset) -> "pd.DataFrame":
     -------
     DataFrame
         Columns ``episode``, ``time``, the names of the states, actions, params and references,
-        ``reward``, the names of the context, and ``group``, ``terminated`` (if any episode is)
-        and ``time_origin`` (if any is known). Actions, rewards and changing params are NaN in
-        the last row of an episode, to which no step belongs. `from_frame` gives the dataset
-        back. Where ids repeat (a bootstrap sample), episodes are numbered instead.
+        ``reward``, ``observed_<name>`` (where a transformer estimated the states), the names of
+        the context, and ``group``, ``terminated`` (if any episode is) and ``time_origin`` (if
+        any is known). Actions, rewards and changing params are NaN in the last row of an
+        episode, to which no step belongs. `from_frame` gives the dataset back (without
+        `observed`). Where ids repeat (a bootstrap sample), episodes are numbered instead.
 
     Raises
     ------
@@ -231,6 +233,8 @@ def build_table(
         values["rewards"] = [by_step(ds.rewards)]
     if ds.references is not None:
         values["references"] = list(ds.references.T)
+    if ds.observed is not None:
+        values["observed"] = list(ds.observed.T)
     if ds.group is not None:
         values["group"] = [by_episode(ds.group)]
     if (params := ds.step_params) is not None:
@@ -286,6 +290,7 @@ def describe(ds: TrajectoryDataset) -> "pd.DataFrame":
         ("rewards", ("reward",), None if ds.rewards is None else ds.rewards[:, None]),
         ("params", ds.param_names, params),
         ("references", ds.reference_names, ds.references),
+        ("observed", ds.observed_names, ds.observed),
         ("time_origin", ("time_origin",), known[:, None] if len(known) else None),
         ("terminated", ("terminated",), ds.terminated[:, None] if ds.terminated.any() else None),
     ):

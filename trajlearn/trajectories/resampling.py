@@ -61,7 +61,7 @@ def decimate(ds: TrajectoryDataset, k: int) -> TrajectoryDataset:
     rewards = columns.rewards
     if rewards is not None:
         rewards = rewards[steps[:, None] + np.arange(k)].mean(axis=1)
-    references = columns.references
+    references, observed = columns.references, columns.observed
     return like(
         ds,
         replace(
@@ -70,6 +70,7 @@ def decimate(ds: TrajectoryDataset, k: int) -> TrajectoryDataset:
             states=columns.states[states],
             times=columns.times[states],
             references=None if references is None else references[states],
+            observed=None if observed is None else observed[states],
             rewards=rewards,
         ),
     )
@@ -78,9 +79,9 @@ def decimate(ds: TrajectoryDataset, k: int) -> TrajectoryDataset:
 def resample(ds: TrajectoryDataset, dt: float) -> TrajectoryDataset:
     """Episodes on the uniform grid ``times[0] + j * dt``, up to the last time.
 
-    States and references are interpolated linearly; actions and theta are held (the value in
-    force at the beginning of the new step). The reward of a new step is the mean of the rewards
-    over its time, each held during its own step. Less than one `dt` at the end is left out;
+    States, `observed` and references are interpolated linearly; actions and theta are held (the
+    value in force at the beginning of the new step). The reward of a new step is the mean of the
+    rewards over its time, each held during its own step. Less than one `dt` at the end is left out;
     `terminated` is kept.
 
     A new step never spans a change of theta: an episode where one would is split at its
@@ -135,7 +136,7 @@ def resample(ds: TrajectoryDataset, dt: float) -> TrajectoryDataset:
     is_step = np.ones(len(times), dtype=bool)
     is_step[offsets[1:] - 1] = False
     held = (step + np.repeat(columns.step_offsets[:-1], counts + 1))[is_step]
-    rewards, references = columns.rewards, columns.references
+    rewards, references, observed = columns.rewards, columns.references, columns.observed
     if rewards is not None:
         rewards = np.diff(mix(_integral(columns, rewards)))[is_step[:-1]] / dt
     return like(
@@ -146,6 +147,7 @@ def resample(ds: TrajectoryDataset, dt: float) -> TrajectoryDataset:
             states=mix(columns.states),
             times=times,
             references=None if references is None else mix(references),
+            observed=None if observed is None else mix(observed),
             rewards=rewards,
         ),
     )
