@@ -8,6 +8,8 @@ from trajlearn._version import __version__
 # public name -> module, imported on first use so that `import trajlearn` stays light
 _MODULE_OF = {
     "EpisodeRelabeler": "trajectories",
+    "KalmanSmoother": "trajectories",
+    "StateSpaceModel": "trajectories",
     "SubtrajectoryRelabeler": "trajectories",
     "Trajectory": "trajectories",
     "TrajectoryDataset": "trajectories",
@@ -56,6 +58,7 @@ _MODULE_OF = {
     "InvalidEpisodeError": "exceptions",
     "MissingFieldError": "exceptions",
     "MixedSamplingError": "exceptions",
+    "SmoothingWarning": "exceptions",
     "UnknownFileError": "exceptions",
 }
 

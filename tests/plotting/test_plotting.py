@@ -5,8 +5,14 @@ import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 from sklearn.linear_model import LinearRegression
+from sklearn.pipeline import make_pipeline
 
-from trajlearn import MLPEnsembleRegressor, TrajectoryDataset, TrajectoryRegressor
+from trajlearn import (
+    KalmanSmoother,
+    MLPEnsembleRegressor,
+    TrajectoryDataset,
+    TrajectoryRegressor,
+)
 from trajlearn.evaluation import (
     cross_validate_horizons,
     horizon_errors,
@@ -253,3 +259,16 @@ def test_a_missing_matplotlib_says_what_to_install(decays, model, monkeypatch, f
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ImportError, match=rf"{function.__name__} needs .*trajlearn\[plot\]"):
         function(*arguments)
+
+
+def test_a_state_that_was_estimated_has_a_forecast_and_no_log():
+    """A smoother appends a velocity: it is drawn, and the position beside it is the logged one."""
+    rng = np.random.default_rng(0)
+    track = np.cumsum(np.cumsum(rng.normal(size=(6, 30, 1)), axis=1), axis=1)
+    ds = TrajectoryDataset.from_arrays(track + rng.normal(size=track.shape), state_names=["x"])
+    model = make_pipeline(
+        KalmanSmoother(append_velocities=True), TrajectoryRegressor(LinearRegression())
+    )
+    axes = plot_forecast(model.fit(ds).predict(ds, start=5), ds, episode=2)
+    assert [len(ax.lines) for ax in axes] == [2, 1]
+    np.testing.assert_array_equal(axes[0].lines[0].get_ydata(), ds[2].states[:, 0])

@@ -75,7 +75,8 @@ def plot_forecast(
     names = [states] if isinstance(states, str) else list(states or forecast.state_names)
     drawn = _of_episode(forecast, ds, episode)
     columns = _columns(forecast.state_names, names)
-    logged = with_states_of(forecast, ds).states[:, columns]
+    shared = with_states_of(forecast, ds)
+    measured = dict(zip(shared.state_names, shared.states.T))
     if axes is None:
         size = (6.4, 0.9 + 1.3 * len(names))
         figure, axes = plt.subplots(
@@ -86,10 +87,14 @@ def plot_forecast(
     if len(panels) != len(names):
         raise ValueError(f"{len(panels)} axes for {len(names)} states: give one a state.")
     first, last = ds.offsets[episode : episode + 2]
-    for ax, name, column, values in zip(panels, names, columns, logged.T):
-        ax.plot(ds.times[first:last], values[first:last], color=INK, lw=1.2, label="logged")
+    for ax, name, column in zip(panels, names, columns):
+        # an estimated velocity was not measured
+        logged = measured[name][first:last] if name in measured else None
+        if logged is not None:
+            ax.plot(ds.times[first:last], logged, color=INK, lw=1.2, label="logged")
         _draw(ax, drawn, column, level)
-        _limit(ax, values[first:last])
+        if logged is not None:
+            _limit(ax, logged)
         ax.set_ylabel(_with_unit(name, units))
         tidy(ax)
     panels[-1].set_xlabel(_with_unit("time", units))

@@ -298,11 +298,15 @@ def assign(ds: TrajectoryDataset, **fields: Any) -> TrajectoryDataset:
         field = f"{key.removesuffix('_names')}s"
         if field in new and _width(new[field]) != len(names[key]):
             del names[key]
-    return TrajectoryDataset.from_arrays(
+    changed = TrajectoryDataset.from_arrays(
         [episode.states for episode in ds],
         state_names=ds.state_names,
         **{**names, **kept, **new},
     )
+    if ds.observed is None:
+        return changed
+    columns = replace(changed._columns, observed=ds.observed)
+    return TrajectoryDataset._of(columns, changed._names | {"observed": ds.observed_names})
 
 
 _ASSIGNABLE = {
