@@ -1,5 +1,6 @@
 """How Sphinx builds these pages; warnings are errors (`make docs`)."""
 
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,17 @@ myst_heading_anchors = 3
 nb_execution_mode = "force"
 nb_execution_timeout = 300
 nb_execution_show_tb = True
+
+
+def flights_at_hand() -> bool:
+    """Whether the notebook on real flights can run without a download."""
+    homes = (os.environ.get(name) for name in ("TRAJLEARN_FLIGHTS", "TRAJLEARN_DATA"))
+    home = next(filter(None, homes), "~/trajlearn_data")
+    return Path(home, "crazyflie_lee_gains").expanduser().is_dir()
+
+
+# Without the flights its page shows the code alone.
+nb_execution_excludepatterns = [] if flights_at_hand() else ["notebooks/real_flights.ipynb"]
 nb_merge_streams = True
 
 html_theme = "pydata_sphinx_theme"

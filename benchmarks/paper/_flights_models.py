@@ -35,7 +35,7 @@ Floats = NDArray[np.float64]
 
 #: Gradient steps; those of the paper's T are its epochs in full mode.
 STEPS = {
-    "full": {"T": 5000, "C": 2500, "D": 2500, "LSTM": 250},
+    "full": {"T": 4000, "C": 2500, "D": 2500, "LSTM": 250},
     "quick": {"T": 800, "C": 800, "D": 800, "LSTM": 60},
 }
 #: Rows that do not depend on a seed.

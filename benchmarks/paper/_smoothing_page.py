@@ -9,7 +9,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from benchmarks.paper._command import Tables, markdown
-from benchmarks.paper._figures import ERROR
+from benchmarks.paper._figures import ERROR, share_y
 from benchmarks.paper._intervals import rounded, spread
 from benchmarks.paper._rollouts import windows
 from benchmarks.paper._tasks import shape
@@ -66,6 +66,7 @@ def report(tables: Tables) -> str:
             "",
             *verdicts(far),
             "",
+            *_damped(far),
         ]
     return "\n".join(lines)
 
@@ -292,6 +293,22 @@ def verdicts(errors: pd.DataFrame) -> list[str]:
     return lines
 
 
+def _damped(errors: pd.DataFrame) -> list[str]:
+    """A word where models trained on noisy states look better than without noise."""
+    some = cost(errors)
+    better = some.groupby(["line", "noise"])["raw"].max() < 1 / _COST
+    named = sorted({line for line, _ in better.index[better] if "logged" in line})
+    if not named:
+        return []
+    return [
+        f"Where noise seems to help ({'; '.join(named)}) it is no merit: with logged actions a "
+        "good model of an unstable plant lets the error of its start grow as the plant does. Noise "
+        "in the inputs damps what a one-step model learns, and less grows: a model trained on "
+        "better states can forecast worse.",
+        "",
+    ]
+
+
 def _ordered(costs: pd.DataFrame, errors: pd.DataFrame) -> Any:
     """Groups of start, line and noise; models as in the table of errors."""
     models = pd.CategoricalDtype(list(errors["line"].unique()), ordered=True)
@@ -365,7 +382,6 @@ def _draw_forecasts(errors: pd.DataFrame, window: str) -> Any:
         len(lines),
         figsize=(1 + 2.7 * len(lines), 0.6 + 2.6 * len(rows)),
         layout="constrained",
-        sharey="row",
         sharex=True,
         squeeze=False,
     )
@@ -383,6 +399,8 @@ def _draw_forecasts(errors: pd.DataFrame, window: str) -> Any:
             ax.set_title(f"{line}, from state {start}", loc="left", fontsize=9)
             tidy(ax)
         axes[0].set_ylabel(f"{task}, from state {start}\n{ERROR}", fontsize=9)
+        # on an unstable plant errors with logged actions are of another size
+        share_y([ax for ax, line in zip(axes, lines, strict=True) if "logged" not in line])
     for ax in grid[-1]:
         ax.set_xlabel("noise (% of the state's std)")
     shown = " and ".join(f"{_steps(window, task)} on {task}" for task in errors["task"].unique())

@@ -63,10 +63,15 @@ def measured(
     length = shape(task).length + max(STARTS)
     train, test = episodes(task, seed, n_test=N_TEST[mode], test_length=length)
     noisy = [
-        some.add_noise(noise, random_state=1000 + 2 * seed + k)
+        some.add_noise(noise, random_state=_noise_seed(seed) + k)
         for k, some in enumerate((train, test))
     ]
     return train, test, *noisy
+
+
+def _noise_seed(seed: int) -> int:
+    """Of the training episodes; the next number is that of the test episodes."""
+    return 1000 + 2 * seed
 
 
 def smoother(task: str, model: str, fused: bool) -> KalmanSmoother:
@@ -116,14 +121,14 @@ def choice_cell(task: str, fused: bool, noise: float, seed: int) -> dict[str, st
     """The likelier model of motion of each filter, by name of its (position) state."""
     train, _ = episodes(task, seed, n_test=1, test_length=1)
     estimator = smoother(task, "auto", fused)
-    fitted(estimator, train.add_noise(noise, random_state=1000 + 2 * seed))
+    fitted(estimator, train.add_noise(noise, random_state=_noise_seed(seed)))
     return estimator.models_
 
 
 def state_cell(task: str, noise: float, model: str, fused: bool, seed: int) -> dict[str, Any]:
     """Errors of the training states with one smoother."""
     true, _ = episodes(task, seed, n_test=1, test_length=1)
-    noisy = true.add_noise(noise, random_state=1000 + 2 * seed)
+    noisy = true.add_noise(noise, random_state=_noise_seed(seed))
     estimator = smoother(task, model, fused)
     return state_errors(estimator, true, noisy, *fitted(estimator, noisy))
 
@@ -211,7 +216,8 @@ def run(run: Run) -> Tables:
     tasks, mode = STATES[run.mode], run.mode
     choice = _choice(run, tasks)
     chosen = {
-        task: Counter(some["model"]).most_common(1)[0][0] for task, some in choice.groupby("task")
+        str(task): Counter(some["model"]).most_common(1)[0][0]
+        for task, some in choice.groupby("task")
     }
     forecasts = _forecast_cells(run, chosen)
     done = {(cell["task"], cell["model"], cell["fused"]) for cell in forecasts if cell["model"]}
