@@ -26,8 +26,10 @@ HORIZONS = (1, 5, 10, 25, 50, 100, 200)
 STRIDE = 10
 #: The axes along which a path leads.
 DRIVEN = {"line_y": ("y",), "line_x": ("x",), "figure8": ("x", "y")}
-#: From that phase [s] on all flights of a kind are logged: the window that ranking compares.
+#: From that phase [s] on all flights of a kind are logged, until that phase the set-point moves:
+#: the window that ranking compares. What follows is hovering, whose wobble no gain explains.
 COMMON_FROM = {"line_y": 1.24, "line_x": 0.24, "figure8": 0.04}
+MOTION_UNTIL = {"line_y": 3.54, "line_x": 4.72, "figure8": 7.04}
 ATTITUDE = ("roll", "pitch", "yaw")
 
 
@@ -149,8 +151,8 @@ def tracking_errors(
     Returns
     -------
     dict of ndarray of shape (n,)
-        ``common``: over the part of the motion that all flights of the kind have; ``full``: from
-        its beginning on, NaN where that is not logged.
+        ``common``: over the part of the motion that all flights of the kind have; ``full``: over
+        all of it, NaN where its beginning is not logged.
     """
     assert ds.references is not None  # the flights have a set-point
     result = {name: np.full(len(ds), np.nan) for name in ("common", "full")}
@@ -160,10 +162,12 @@ def tracking_errors(
         axes = [ds.state_names.index(name) for name in DRIVEN[kind]]
         off = states[np.ix_(rows, axes)] - ds.references[np.ix_(rows, axes)]
         squared = (off**2).sum(axis=1)
-        common = ds.times[rows] - ds.time_origin[i] >= COMMON_FROM[kind]
+        phase = ds.times[rows] - ds.time_origin[i]
+        moving = phase <= MOTION_UNTIL[kind]
+        common = moving & (phase >= COMMON_FROM[kind])
         result["common"][i] = np.sqrt(squared[common].mean())
         if start_logged[i]:
-            result["full"][i] = np.sqrt(squared.mean())
+            result["full"][i] = np.sqrt(squared[moving].mean())
     return result
 
 

@@ -1,4 +1,4 @@
-"""Text and figures of the smoothing benchmark, from its tables alone."""
+"""Text of the smoothing benchmark, from its tables alone."""
 
 from collections.abc import Iterable
 from itertools import product
@@ -6,21 +6,22 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from benchmarks.paper._command import Tables, markdown
-from benchmarks.paper._figures import ERROR, share_y
 from benchmarks.paper._intervals import rounded, spread
 from benchmarks.paper._rollouts import windows
-from benchmarks.paper._tasks import shape
+from benchmarks.paper._tasks import QUADROTOR, shape
 from benchmarks.paper.horizon_error import named_models
-from trajlearn.plotting._style import GREY, line_style, tidy
 
 #: What models are trained on, as tables and legends say it.
 LABELS = {"raw": "measured", "smoothed": "smoothed", "true": "true"}
 # changes of an error that are called one, and costs of noise that are worth giving back
 _CHANGE, _COST = 0.05, 1.5
 _KEYS = ["start", "line"]
+_PROCESS_NOISE = (
+    "The plant has process noise that shifts every state, the angles as well, from step to step. A "
+    "smooth motion has no such shifts: the smoother takes them for measurement noise."
+)
 
 
 def report(tables: Tables) -> str:
@@ -53,12 +54,12 @@ def report(tables: Tables) -> str:
     for task, some in errors.groupby("task", sort=False):
         lines += [f"### {task}", "", *_start_states(str(task), tables["starts"]), ""]
         for window, few in some.groupby("window", sort=False):
-            lines += [f"Horizons {_steps(str(window), str(task))}:", ""]
+            lines += [f"Horizons {steps_of(str(window), str(task))}:", ""]
             lines += [markdown(error_table(few)), "", *_diverged(few)]
         far = some[some["window"] == "long"]
         lines += [
-            f"What noise costs at horizons {_steps('long', str(task))}: the error in multiples of "
-            "that of the same model on noise-free data, and what smoothing divides it by "
+            f"What noise costs at horizons {steps_of('long', str(task))}: the error in multiples "
+            "of that of the same model on noise-free data, and what smoothing divides it by "
             "(measured / smoothed, least to greatest over seeds). Given back: the share of the "
             "cost, in logarithms.",
             "",
@@ -85,6 +86,7 @@ def _states(task: str, states: pd.DataFrame, choice: pd.DataFrame) -> list[str]:
         f"Smoother: {name}. The likelihood of other training episodes prefers this model in "
         f"{voted} of {len(picked)} filters.",
         "",
+        *([_PROCESS_NOISE, ""] if task in QUADROTOR else []),
         markdown(state_table(used)),
         "",
         *state_sentences(used),
@@ -104,7 +106,7 @@ def state_table(states: pd.DataFrame) -> pd.DataFrame:
     states : DataFrame
         Of one task and smoother.
     """
-    some = _in_noise(states[states["noise"] > 0])
+    some = in_noise(states[states["noise"] > 0])
     kinds = some["state"].unique()
     if len(kinds) > 8:
         # cos_base_z and its like
@@ -115,8 +117,8 @@ def state_table(states: pd.DataFrame) -> pd.DataFrame:
         for noise, cell in few.groupby("noise"):
             mean = cell.groupby("seed")[["filtered", "smoothed", "estimated_noise"]].mean()
             for column, title in (("filtered", "filtered"), ("smoothed", "smoothed")):
-                line[f"{title}, {_percent(noise)}"] = spread(mean[column])
-            line[f"estimated, {_percent(noise)}"] = rounded(mean["estimated_noise"].median())
+                line[f"{title}, {percent(noise)}"] = spread(mean[column])
+            line[f"estimated, {percent(noise)}"] = rounded(mean["estimated_noise"].median())
         lines.append(line)
     return pd.DataFrame(lines)
 
@@ -153,23 +155,23 @@ def state_sentences(states: pd.DataFrame) -> list[str]:
                 f"hardly changes (by less than {_CHANGE:.0%}), or not in the same direction for "
                 f"every seed, that of {_listed(same.index[same], len(same))}"
             )
-        lines.append(f"- {_percent(noise)} noise: smoothing {'; '.join(parts)}.")
+        lines.append(f"- {percent(noise)} noise: smoothing {'; '.join(parts)}.")
     return lines
 
 
 def _smoother_table(states: pd.DataFrame) -> pd.DataFrame:
-    some = _in_noise(states[states["noise"] > 0])
+    some = in_noise(states[states["noise"] > 0])
     lines = []
     for (name, used), few in some.groupby(["smoother", "used"], sort=False):
         line = {"smoother": f"**{name}**" if used else name}
         for noise, cell in few.groupby("noise"):
             logs = np.log(cell["smoothed"]).groupby(cell["seed"]).mean()
-            line[_percent(noise)] = spread(np.exp(logs))
+            line[percent(noise)] = spread(np.exp(logs))
         lines.append(line)
     return pd.DataFrame(lines)
 
 
-def _in_noise(states: pd.DataFrame) -> pd.DataFrame:
+def in_noise(states: pd.DataFrame) -> pd.DataFrame:
     """Errors in units of the noise that the states have."""
     columns = ["filtered", "smoothed", "estimated_noise"]
     return states.assign(**{c: states[c] / states["raw"] for c in columns})
@@ -180,7 +182,8 @@ def _listed(names: Iterable[str], of: int) -> str:
     return "all states" if len(some) == of else ", ".join(some)
 
 
-def _percent(noise: Any) -> str:
+def percent(noise: Any) -> str:
+    """Noise as tables and figures say it."""
     return f"{100 * noise:g} %"
 
 
@@ -194,7 +197,7 @@ def _start_states(task: str, starts: pd.DataFrame) -> list[str]:
     for start, few in some.groupby("start"):
         wide = few.pivot(index=["noise", "seed"], columns="states", values="error")
         ratio = (wide["smoothed"] / wide["raw"]).groupby("noise")
-        parts = [f"{spread(values)} at {_percent(noise)} noise" for noise, values in ratio]
+        parts = [f"{spread(values)} at {percent(noise)} noise" for noise, values in ratio]
         lines.append(
             f"- The error of state {start} of the test episodes, filtered / measured: "
             f"{', '.join(parts)}."
@@ -211,7 +214,7 @@ def error_table(errors: pd.DataFrame) -> pd.DataFrame:
         [
             {"start": start, "model": line, "trained on": LABELS[states]}
             | {
-                _percent(noise): spread(by[start, line, states, noise])
+                percent(noise): spread(by[start, line, states, noise])
                 for noise in noises
                 if (start, line, states, noise) in by
             }
@@ -225,7 +228,7 @@ def _diverged(errors: pd.DataFrame) -> list[str]:
     for (line, states, noise), some in errors.groupby(["line", "states", "noise"], sort=False):
         n, of = some["n_diverged"].sum(), some["n_episodes"].sum()
         if n:
-            lines.append(f"{line} on {LABELS[states]} states, {_percent(noise)}: {n} of {of}")
+            lines.append(f"{line} on {LABELS[states]} states, {percent(noise)}: {n} of {of}")
     return [f"Diverged (infinite): {'; '.join(lines)}.", ""] if lines else []
 
 
@@ -262,7 +265,7 @@ def cost_table(errors: pd.DataFrame) -> pd.DataFrame:
     """`cost` for reading: a line a start, model and noise."""
     lines = []
     for (start, line, noise), some in _ordered(cost(errors), errors):
-        row = {"start": start, "model": line, "noise": _percent(noise)}
+        row = {"start": start, "model": line, "noise": percent(noise)}
         for states, label in LABELS.items():
             known = some[states].notna().any()
             row[label] = f"x {rounded(some[states].median())}" if known else None
@@ -285,7 +288,7 @@ def verdicts(errors: pd.DataFrame) -> list[str]:
         else:
             verdict = "makes no difference that all seeds share"
         found = parts.setdefault((start, line), {})
-        found.setdefault(verdict, []).append(_percent(noise))
+        found.setdefault(verdict, []).append(percent(noise))
     lines = []
     for (start, line), found in parts.items():
         said = [f"{verdict} at {', '.join(noises)} noise" for verdict, noises in found.items()]
@@ -315,104 +318,8 @@ def _ordered(costs: pd.DataFrame, errors: pd.DataFrame) -> Any:
     return costs.astype({"line": models}).groupby([*_KEYS, "noise"], observed=True)
 
 
-def _steps(window: str, task: str) -> str:
+def steps_of(window: str, task: str) -> str:
+    """First and last horizon of a window."""
     length = shape(task).length
     steps = np.arange(1, length + 1)[windows(length)[window]]
     return f"{steps[0]} to {steps[-1]} ({window})"
-
-
-# -- figures ------------------------------------------------------------------------------
-
-
-def draw(tables: Tables) -> dict[str, Any]:
-    """States by noise; forecasts by noise, one figure a window of horizons."""
-    errors = tables["errors"].assign(line=named_models(tables["errors"]))
-    figures = {
-        f"smoothing-{window}": _draw_forecasts(some, str(window))
-        for window, some in errors.groupby("window", sort=False)
-    }
-    return {"smoothing-states": _draw_states(tables["states"])} | figures
-
-
-def _draw_states(states: pd.DataFrame) -> Any:
-    import matplotlib.pyplot as plt
-
-    some = _in_noise(states[states["used"] & (states["noise"] > 0)])
-    tasks, noises = some["task"].unique(), np.sort(some["noise"].unique())
-    figure, grid = plt.subplots(
-        len(tasks),
-        len(noises),
-        figsize=(1.5 + 3.6 * len(noises), 2.9 * len(tasks)),
-        layout="constrained",
-        sharey=True,
-        squeeze=False,
-    )
-    bars = (("filtered", -0.2, "#bbbbbb", ""), ("smoothed", 0.2, "#0072B2", "///"))
-    for axes, task in zip(grid, tasks, strict=True):
-        of_task = some[some["task"] == task]
-        for ax, noise in zip(axes, noises, strict=True):
-            few = of_task[of_task["noise"] == noise]
-            names = list(few["state"].unique())
-            x = np.arange(len(names))
-            for column, shift, colour, hatch in bars:
-                over = few.groupby("state", sort=False)[column].agg(["median", "min", "max"])
-                middle = over["median"].to_numpy()
-                error = np.abs(over[["min", "max"]].to_numpy().T - middle)
-                look = {"color": colour, "hatch": hatch, "edgecolor": "black", "lw": 0.5}
-                ax.bar(x + shift, middle, 0.4, yerr=error, capsize=2, label=column, **look)
-            ax.axhline(1, color=GREY, lw=1, ls="dashed", label="measured")
-            ax.set_xticks(x, names, rotation=90 if len(names) > 8 else 0, fontsize=8)
-            (smoother,) = few["smoother"].unique()
-            title = f"{task}, {_percent(noise)} noise\n({smoother})"
-            ax.set_title(title, loc="left", fontsize=10)
-            tidy(ax)
-        axes[0].set_ylabel("error of state / noise")
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
-    return figure
-
-
-def _draw_forecasts(errors: pd.DataFrame, window: str) -> Any:
-    import matplotlib.pyplot as plt
-
-    lines = list(errors["line"].unique())
-    rows = list(errors[["task", "start"]].drop_duplicates().itertuples(index=False, name=None))
-    figure, grid = plt.subplots(
-        len(rows),
-        len(lines),
-        figsize=(1 + 2.7 * len(lines), 0.6 + 2.6 * len(rows)),
-        layout="constrained",
-        sharex=True,
-        squeeze=False,
-    )
-    noises = np.sort(errors["noise"].unique())
-    for axes, (task, start) in zip(grid, rows, strict=True):
-        of_row = errors[(errors["task"] == task) & (errors["start"] == start)]
-        for ax, line in zip(axes, lines, strict=True):
-            for i, (states, label) in enumerate(LABELS.items()):
-                few = of_row[(of_row["line"] == line) & (of_row["states"] == states)]
-                over = few.groupby("noise")["median"].agg(["median", "min", "max"])
-                over = over.clip(upper=1e12)
-                _draw_line(ax, np.searchsorted(noises, over.index), over, i, label)
-            ax.set_yscale("log")
-            ax.set_xticks(range(len(noises)), [f"{100 * noise:g}" for noise in noises])
-            ax.set_title(f"{line}, from state {start}", loc="left", fontsize=9)
-            tidy(ax)
-        axes[0].set_ylabel(f"{task}, from state {start}\n{ERROR}", fontsize=9)
-        # on an unstable plant errors with logged actions are of another size
-        share_y([ax for ax, line in zip(axes, lines, strict=True) if "logged" not in line])
-    for ax in grid[-1]:
-        ax.set_xlabel("noise (% of the state's std)")
-    shown = " and ".join(f"{_steps(window, task)} on {task}" for task in errors["task"].unique())
-    figure.suptitle(f"Horizons {shown}", fontsize=10)
-    handles, labels = grid[0, 0].get_legend_handles_labels()
-    title = "trained on states that are"
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, title=title)
-    return figure
-
-
-def _draw_line(ax: Any, x: NDArray[Any], over: pd.DataFrame, i: int, label: str) -> None:
-    style = line_style(i)
-    marker = {"marker": "os^"[i], "ms": 5, "mfc": "white"}
-    ax.plot(x, over["median"], lw=1.5, label=label, **marker, **style)
-    ax.fill_between(x, over["min"], over["max"], color=style["color"], alpha=0.15, lw=0)

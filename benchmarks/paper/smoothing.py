@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from benchmarks.paper._command import Benchmark, Run, Tables
 from benchmarks.paper._models import build
 from benchmarks.paper._rollouts import N_TEST, action_sources, expected_warnings, windows
-from benchmarks.paper._smoothing_page import LABELS, draw, report
+from benchmarks.paper._smoothing_figures import draw
+from benchmarks.paper._smoothing_page import LABELS, report
 from benchmarks.paper._tasks import N_EPISODES, TASKS, environment, episodes, shape
 from trajlearn import TrajectoryDataset, horizon_errors
 from trajlearn.exceptions import SmoothingWarning
