@@ -49,10 +49,11 @@ AVERAGE = [
     "C",
     "average",
 ]
+NO_GAINS = ["T, tracking error, no gains"]
 CELLS = [
     ["hold", "reference", "mean flight"],
     AVERAGE,
-    ["T, tracking error, no gains"],
+    NO_GAINS,
     ["T, state"],
     ["T, paper"],
     ["D, logged actions"],
