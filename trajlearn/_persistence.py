@@ -50,6 +50,7 @@ _CLASSES = {
         "trajlearn.trajectories._layout": ("Layout",),
         "trajlearn.envs": ("AttitudePD",),
         "trajlearn.policies": ("LinearFeedback", "PID"),
+        "sklearn.frozen": ("FrozenEstimator",),
         "sklearn.preprocessing": (
             "FunctionTransformer",
             "MaxAbsScaler",

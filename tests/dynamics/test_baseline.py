@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sklearn.exceptions import NotFittedError
 from sklearn.frozen import FrozenEstimator
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
@@ -9,7 +10,9 @@ from sklearn.preprocessing import PolynomialFeatures
 
 from trajlearn import (
     BlockScaler,
+    DivergenceWarning,
     HoldForecaster,
+    HorizonWarning,
     LSTMRegressor,
     MeanEpisodeForecaster,
     MissingFieldError,
@@ -123,15 +126,17 @@ def test_a_policy_gets_the_states_themselves():
         seen.append(states.copy())
         return np.zeros((len(states), 1))
 
-    model = OneStepRegressor(LinearRegression(), baseline=same, policy=policy).fit(ds)
-    model.predict(ds, start=3, horizon=2)
+    inputs = ("action", "references")
+    model = OneStepRegressor(LinearRegression(), inputs=inputs, baseline=same, policy=policy)
+    model.fit(ds).predict(ds, start=3, horizon=2)
     np.testing.assert_allclose(seen[0], ds.states[ds.state_rows(3)], atol=1e-12)
 
 
 def test_a_recurrent_model_takes_a_baseline():
     ds = tracking(n=8)
     model = LSTMRegressor(inputs="params", baseline=same, max_steps=5, random_state=0).fit(ds)
-    assert error(model, ds, start=2, horizon=12) < 2.0
+    # were the baseline not added back, it would be three times that
+    assert error(model, ds, start=2, horizon=12) < 0.1
 
 
 # -- the kinds of baseline ----------------------------------------------------------------
@@ -278,8 +283,10 @@ def test_missing_signals_are_named():
     with pytest.raises(MissingFieldError, match="references"):
         model.predict_trajectory([0.0], context={"kind": "a"}, phase=0.0, **plan)
     still = {"references": np.zeros((2, 1)), **plan}
-    with pytest.raises(MissingFieldError, match="time_origin"):
+    with pytest.raises(MissingFieldError, match="give phase="):
         model.predict_trajectory([0.0], context={"kind": "a"}, **still)
+    with pytest.raises(ValueError, match="must be a number"):
+        model.predict_trajectory([0.0], context={"kind": "a"}, phase="early", **still)
     with pytest.raises(MissingFieldError, match="kind"):
         model.predict_trajectory([0.0], phase=0.0, **still)
     with pytest.raises(ValueError, match="did not see"):
@@ -303,6 +310,14 @@ def test_baselines_that_make_no_sense_are_refused():
     with_actions = ds.assign(actions=[np.zeros((t, 1)) for t in ds.lengths])
     with pytest.raises(ValueError, match="logged actions"):
         small(baseline=OneStepRegressor(LinearRegression())).fit(with_actions)
+    with pytest.raises(ValueError, match=r'inputs=\("action", "references"\)'):
+        OneStepRegressor(LinearRegression(), baseline=same).fit(with_actions)
+    with pytest.raises(NotFittedError):
+        small(baseline=FrozenEstimator(MeanEpisodeForecaster())).fit(ds)
+    with pytest.raises(ValueError, match=r"context \{'kind': 'b'\}"):
+        small(baseline="mean").fit(ds[[0, 1, 2]])
+    with pytest.raises(ValueError, match="diverged on training"):
+        small(baseline=lambda r: np.full_like(r, np.inf)).fit(ds)
     with pytest.raises(ValueError, match="no training episode"):
         MeanEpisodeForecaster().fit(ds[[0, 2]]).predict(ds)
     with pytest.raises(ValueError, match="uncertainty"):
@@ -316,6 +331,139 @@ def test_saved_and_read_again(baseline, tmp_path):
     model.save(tmp_path / "t.safetensors")
     again = load(tmp_path / "t.safetensors", callables={"same": same})
     np.testing.assert_array_equal(again.predict(ds).mean, model.predict(ds).mean)
+
+
+def irregular(n=6, seed=0):
+    """`tracking` with every step of the log a little shorter or longer."""
+    ds, rng = tracking(n, seed=seed), np.random.default_rng(seed)
+    times = [e.times + np.r_[0.0, rng.uniform(-0.2, 0.2, len(e)) * DT] for e in ds]
+    return ds.assign(times=times)
+
+
+def test_an_episode_is_as_good_alone_as_among_others_where_times_are_irregular():
+    ds = irregular()
+    model = TrajectoryRegressor(LinearRegression(), baseline=HoldForecaster(), random_state=0)
+    together = model.fit(ds).predict(ds).mean
+    alone = model.predict(ds[[2]]).mean[0]
+    np.testing.assert_allclose(together[2, : len(alone)], alone, atol=1e-12)
+
+
+def test_forecasts_end_where_the_baseline_does():
+    ds = tracking(n=6)
+    blocks = SubtrajectoryRelabeler(inputs=["state", "horizon", "params"])
+    model = TrajectoryRegressor(
+        LinearRegression(), relabeler=blocks, baseline=same, random_state=0
+    ).fit(ds)
+    np.testing.assert_array_equal(model.predict(ds, horizon=80).lengths, ds.lengths)
+    free = model.set_params(baseline="mean").fit(ds)
+    with pytest.warns(HorizonWarning):
+        assert (free.predict(ds, horizon=80).lengths == 80).all()
+
+
+def test_a_baseline_that_diverges_spoils_its_own_episode_alone():
+    ds = tracking(n=6)
+
+    def state_of(references):
+        return np.where(references > 40, np.inf, references)
+
+    model = TrajectoryRegressor(LinearRegression(), baseline=state_of, random_state=0).fit(ds)
+    far = [episode.references.copy() for episode in ds]
+    far[1][20:] = 50
+    other = ds.assign(references=far)
+    np.testing.assert_array_equal(
+        model.predict(other, horizon=10).mean, model.predict(ds, horizon=10).mean
+    )
+    with pytest.warns(DivergenceWarning):
+        forecast = model.predict(other)
+    assert forecast.diverged_at.tolist() == [0, 20, 0, 0, 0, 0]
+
+
+def test_planning_relative_to_a_rolled_out_baseline():
+    ds = tracking(n=8)
+    closed = OneStepRegressor(LinearRegression(), inputs="params")
+    model = TrajectoryRegressor(LinearRegression(), baseline=closed, random_state=0).fit(ds)
+    i = 2
+    phase = ds.times[ds.offsets[i]] - ds.time_origin[i]
+    path = model.predict_trajectory(
+        ds[i].states[0],
+        params=ds.params[i],
+        references=lambda t: np.sin(2 * (phase + t))[:, None],
+        context={"kind": "a"},
+        phase=phase,
+        horizons=[4 * DT, 9 * DT],
+    )
+    logged = model.predict(ds[[i]], horizon=9).mean[0]
+    np.testing.assert_allclose(path.mean[0], logged[[3, 8]], atol=1e-9)
+
+
+def test_one_state_is_meant_for_all_parameters():
+    ds = tracking(n=6)
+    model = small(baseline="mean").set_params(estimator__max_steps=3).fit(ds)
+    known = {"references": np.zeros((3, 1)), "context": {"kind": "a"}, "phase": 0.1}
+    rates = [[0.5], [1.0], [2.0]]
+    several = model.predict_trajectory([0.3], params=rates, horizons=[DT, 2 * DT], **known).mean
+    for rate, path in zip(rates, several):
+        one = model.predict_trajectory([0.3], params=rate, horizons=[DT, 2 * DT], **known)
+        np.testing.assert_array_equal(path, one.mean[0])
+
+
+def test_the_phase_of_a_plan_counts_where_no_training_episode_had_an_origin():
+    ds = tracking(n=6, shift=False).assign(time_origin=None, context=None)
+    model = TrajectoryRegressor(LinearRegression(), baseline="mean", random_state=0).fit(ds)
+    plan = {"params": [1.0], "references": np.zeros((2, 1)), "horizons": [DT]}
+    early, late = (
+        model.predict_trajectory([0.0], phase=phase, **plan).mean[0, 0, 0] for phase in (0.0, 0.7)
+    )
+    assert abs(late - early) > 0.05
+
+
+def test_a_fitted_model_goes_by_what_it_was_fitted_with():
+    ds = tracking(n=6)
+    model = TrajectoryRegressor(LinearRegression(), baseline=same, random_state=0).fit(ds)
+    before = model.predict(ds, horizon=9).mean
+    np.testing.assert_array_equal(
+        model.set_params(baseline=None, gate=None).predict(ds, horizon=9).mean, before
+    )
+
+
+def test_rows_of_a_relative_model_are_refused():
+    ds = tracking(n=6)
+    model = TrajectoryRegressor(LinearRegression(), baseline=same, random_state=0).fit(ds)
+    with pytest.raises(ValueError, match="rows do not say"):
+        model.predict(model.relabeler_.fit_resample(ds)[0])
+
+
+def test_names_of_references_mean_nothing():
+    ds = tracking(n=6).assign(reference_names=["baseline r+h"])
+    model = TrajectoryRegressor(LinearRegression(), baseline=HoldForecaster(), random_state=0)
+    assert np.isfinite(model.fit(ds).predict(ds, horizon=5).mean).all()
+
+
+def test_forecasters_that_learn_nothing_need_one_episode_and_take_weights():
+    ds = tracking(n=2)[[0]]
+    for baseline in (HoldForecaster(), same):
+        model = TrajectoryRegressor(LinearRegression(), baseline=baseline, random_state=0)
+        assert np.isfinite(model.fit(ds, sample_weight=[2.0]).predict(ds).mean).all()
+    assert MeanEpisodeForecaster().learns
+
+
+def test_divergence_is_measured_in_ranges_of_states():
+    """Near-perfect tracking in training makes deviations tiny, and an offset no divergence."""
+    ds = tracking(n=6)
+    perfect = TrajectoryDataset.from_arrays(
+        [episode.references + 1e-9 * np.sin(7 * episode.times)[:, None] for episode in ds],
+        references=[episode.references for episode in ds],
+        params=ds.params,
+    )
+    model = OneStepRegressor(LinearRegression(), inputs="params", baseline=same).fit(perfect)
+    forecast = model.predict(perfect.assign(params=ds.params), horizon=3)
+    off = TrajectoryDataset.from_arrays(
+        [episode.states + 0.5 for episode in perfect],
+        references=[episode.references for episode in ds],
+        params=ds.params,
+    )
+    assert not forecast.diverged_at.any()
+    assert not model.predict(off, horizon=3).diverged_at.any()
 
 
 # -- inputs -------------------------------------------------------------------------------

@@ -228,9 +228,10 @@ def test_planning_is_forecasting_at_any_times():
 # -- uncertainty --------------------------------------------------------------------------
 
 
-def noisy_constant(std, n_steps):
+def noisy_constant(std, n_steps, gate=0.05):
     ds = TrajectoryDataset.from_arrays(np.zeros((3, n_steps + 1, 1)))
-    model = TrajectoryRegressor(Affine(0.0, std=std), scaler=FunctionTransformer()).fit(ds)
+    learner = Affine(0.0, std=std)
+    model = TrajectoryRegressor(learner, scaler=FunctionTransformer(), gate=gate).fit(ds)
     model.target_scale_ = np.ones(1)
     return model, ds
 
@@ -250,8 +251,7 @@ def test_the_std_of_a_sum_over_a_sampled_path(noise_time, power):
 
 
 def test_correlated_noise_keeps_its_variance():
-    model, ds = noisy_constant(0.5, 25)
-    model.gate = None
+    model, ds = noisy_constant(0.5, 25, gate=None)
     rho = 0.8
     model.noise_time_ = np.array([-1 / np.log(rho)])
     samples = model.predict(ds, n_samples=4000, random_state=0).samples

@@ -503,3 +503,6 @@ def test_assign_refuses_what_does_not_fit():
         ds.assign(references=np.zeros((2, 3, 1)))
     with pytest.raises(InvalidEpisodeError):
         ds.assign(params=[[1.0, np.nan], [1.0, 1.0]])
+    for params in (5.0, [1.0, 2.0, 3.0]):
+        with pytest.raises(InvalidEpisodeError, match=r"give 2 for all episodes \(kp, kd\)"):
+            ds.assign(params=params)

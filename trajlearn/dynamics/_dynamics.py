@@ -13,8 +13,10 @@ from trajlearn.dynamics._base import TwoDoorRegressor
 from trajlearn.dynamics._forecaster import Forecaster, Prediction
 from trajlearn.dynamics._planned import broadcast, by_episode, planned
 from trajlearn.dynamics._query import Query
-from trajlearn.dynamics._relative import BASE, ahead, curve, fit_baseline, relative_to
+from trajlearn.dynamics._relative import ahead, curve, fit_baseline, relative_to
+from trajlearn.dynamics.baselines import CurveForecaster
 from trajlearn.dynamics.forecast import Forecast
+from trajlearn.exceptions import MissingFieldError
 from trajlearn.trajectories import TrajectoryDataset, is_episodes
 
 __all__ = ["DynamicsEstimator"]
@@ -59,7 +61,7 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
                 f"baseline={self.baseline!r} needs episodes: rows say neither which episode they "
                 "are from nor when. Fit on episodes, or leave baseline= out."
             )
-        self.baseline_ = None
+        self.baseline_, self.n_references_ = None, 0
         super()._fit_door_of_rows(X, y, sample_weight, groups)
 
     def _fit_episodes(
@@ -67,10 +69,15 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
     ) -> None:
         # a model of one step knows no longest horizon; the others set it
         self._learn_ranges_of(ds)
+        self.n_references_ = len(ds.reference_names)
         self.baseline_, states = fit_baseline(self.baseline, ds, weight, groups, self._rng)
         if states is not None:
-            ds = relative_to(self.baseline_, ds, states)
+            ds = relative_to(ds, states, told=self._told())
         self._fit_states(ds, weight, groups)
+
+    def _told(self) -> bool:
+        """Whether the states of the baseline are inputs."""
+        return not isinstance(self.baseline_, CurveForecaster)
 
     # -- prediction -----------------------------------------------------------------------
 
@@ -87,12 +94,14 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
         base = None
         if self.baseline_ is not None:
             states = curve(self.baseline_, query.ds)
+            # from where it diverged nothing is asked for, or the answer is infinite
+            states = np.where(np.isfinite(states), states, 0.0)
             base = ahead(self.baseline_, query)
             start = states[query.rows][:, None]
             query = replace(
                 query,
-                ds=relative_to(self.baseline_, query.ds, states),
-                base=np.concatenate([start, base], axis=1),
+                ds=relative_to(query.ds, states, told=self._told()),
+                base=np.concatenate([start, np.where(np.isfinite(base), base, 0.0)], axis=1),
             )
         prediction = self._forecast_states(
             query,
@@ -107,6 +116,19 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
             if prediction.samples is not None:
                 prediction.samples = prediction.samples + base
         return prediction
+
+    def _ends_with_log(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
+        own = self._reads_logged_future(ds, actions, policy)
+        base = self.baseline_
+        return own or (isinstance(base, Forecaster) and base._ends_with_log(ds, "auto", None))
+
+    def _predict_rows(self, X: Any, return_std: bool) -> Any:
+        if getattr(self, "baseline_", None) is not None:
+            raise ValueError(
+                "rows do not say which episode they are from, so nothing can be predicted relative "
+                f"to baseline={self.baseline!r}: predict episodes."
+            )
+        return super()._predict_rows(X, return_std)
 
     def predict(
         self,
@@ -193,6 +215,7 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
         Parameters
         ----------
         initial_states : array-like of shape (n, d_s) or (d_s,)
+            One state with n rows of `params` is meant for all of them.
         horizons : array-like of shape (H,)
             Times after the start, increasing and positive, in the unit of `times`.
         params : array-like of shape (n, p) or (p,), optional
@@ -233,9 +256,21 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
         if wanted.ndim != 1 or not len(wanted) or wanted[0] <= 0 or (np.diff(wanted) <= 0).any():
             raise ValueError("horizons must be positive and strictly increasing times.")
         grid, chosen = self._time_grid(wanted)
+        rolled = isinstance(self.baseline_, DynamicsEstimator) and hasattr(self.baseline_, "dt_")
+        if rolled:
+            grid, chosen = self.baseline_._time_grid(wanted)
         if callable(references):
-            grid, chosen = self._looked_at(grid, chosen)
+            if not rolled:
+                grid, chosen = self._looked_at(grid, chosen)
             references = np.asarray(references(np.concatenate([[0.0], grid])), dtype=np.float64)
+        if params is not None and np.ndim(params) == 2 and len(states) == 1:
+            states = np.repeat(states, len(np.asarray(params)), axis=0)
+        needs_phase = "phase" in self.layout_ or getattr(self.baseline_, "has_origin_", False)
+        if needs_phase and phase is None:
+            raise MissingFieldError(
+                f"{type(self).__name__} was fitted with a phase (time_origin): give phase=, the "
+                "time since the motion began, at the start."
+            )
         n = len(states)
         ds = planned(
             states,
@@ -244,7 +279,7 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
             actions=broadcast(actions, (n, len(grid)), "actions"),
             references=broadcast(references, (n, len(grid) + 1), "references"),
             context={key: by_episode(value, n, key) for key, value in (context or {}).items()},
-            phase=np.full(n, np.nan) if phase is None else by_episode(phase, n, "phase"),
+            phase=by_episode(np.nan if phase is None else phase, n, "phase"),
             state_names=self.state_names_,
         )
         use = "auto" if actions is None else "logged"
@@ -274,12 +309,9 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
         for block, width in given.items():
             if block not in self.layout_:
                 continue
-            columns = self.layout_.columns[block]
+            fitted = len(self.layout_.columns[block])
             if block == "references":
-                # they stand there once for each time at which they are looked at
-                ends = [name for name in columns if name.endswith("+h")]
-                columns = tuple(name for name in ends if not name.startswith(BASE))
-            fitted = len(columns)
+                fitted = self.n_references_
             if fitted:
                 ds.require(block, by=f"{type(self).__name__} (fitted with {block})")
             if width != fitted:

@@ -62,6 +62,10 @@ class Forecaster(BaseEstimator):
         """Whether a forecast needs logged signals after the start."""
         return False
 
+    def _ends_with_log(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
+        """Whether a forecast ends with the log, because nobody knows what it needs beyond."""
+        return self._reads_logged_future(ds, actions, policy)
+
     def _learn_ranges(self, states: Floats, names: tuple[str, ...], longest: float) -> None:
         self.state_range_ = np.stack([states.min(axis=0), states.max(axis=0)])
         self.state_names_ = names
@@ -132,7 +136,7 @@ class Forecaster(BaseEstimator):
             ds,
             start,
             horizon,
-            within_log=self._reads_logged_future(ds, actions, policy),
+            within_log=self._ends_with_log(ds, actions, policy),
             within_stretch=self._needs_constant_params,
         )
         self._warn_beyond_training(query)

@@ -34,7 +34,7 @@ def planned(
         states=np.repeat(initial_states, n_states, axis=0),
         times=np.tile(times, n),
         terminated=np.zeros(n, dtype=bool),
-        time_origin=-phase,
+        time_origin=-phase.astype(np.float64),
         ids=np.arange(n),
         actions=None if actions is None else actions.reshape(-1, actions.shape[-1]),
         params=None if params is None or not params.shape[1] else params,
@@ -74,6 +74,8 @@ def broadcast(values: ArrayLike | None, shape: tuple[int, ...], name: str) -> Fl
 def by_episode(value: Any, n: int, name: str) -> NDArray[Any]:
     """One value for each of n episodes, from one for all or one each."""
     values = np.asarray(value)
+    if name == "phase" and values.dtype.kind not in "iuf":
+        raise ValueError(f"phase = {value!r} must be a number, a time.")
     if values.ndim == 0:
         values = np.full(n, values)
     if values.shape != (n,):

@@ -15,6 +15,7 @@ from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES, Prediction
 from trajlearn.dynamics._learner import spread
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics._rollout import InputRows, Limits, Step, roll_out
+from trajlearn.dynamics.baselines import ReferenceForecaster
 from trajlearn.exceptions import MissingFieldError, MixedSamplingError
 from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories._layout import Layout
@@ -101,6 +102,12 @@ class RollingEstimator(DynamicsEstimator):
     ) -> None:
         rows, targets = self.relabeler_.fit_resample(ds)
         self.layout_ = self.relabeler_.layout_
+        blind = "action" in self.layout_ and "references" not in self.layout_
+        if self.baseline_ is not None and blind:
+            raise ValueError(
+                f"baseline={self.baseline!r} with actions as inputs: a deviation alone does not "
+                'say where the plant is. Give inputs=("action", "references"), or inputs="params".'
+            )
         self.rolled_range_ = np.stack([ds.states.min(axis=0), ds.states.max(axis=0)])
         episode = self.relabeler_.sample_indices_
         self._fit_rows(
@@ -141,6 +148,10 @@ class RollingEstimator(DynamicsEstimator):
                 f"the episodes have {len(ds.action_names)} actions, the model was fitted on "
                 f"{block.stop - block.start}."
             )
+
+    def _told(self) -> bool:
+        # the reference is an input already
+        return not isinstance(self.baseline_, ReferenceForecaster)
 
     def _reads_logged_future(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
         return self._source(ds, actions, policy)[0] == "logged" or "references" in self.layout_
@@ -193,12 +204,13 @@ class RollingEstimator(DynamicsEstimator):
 
     def _limits(self) -> Limits:
         low, high = self.rolled_range_
-        width = np.where(high > low, high - low, 1.0)
-        centre = (low + high) / 2
+        centre, width = (low + high) / 2, high - low
         clip = None
         if self.clip_states is not None:
+            width = np.where(width > 0, width, 1.0)
             clip = (centre - self.clip_states * width / 2, centre + self.clip_states * width / 2)
-        return Limits(clip, centre, DIVERGENCE_RANGES * width)
+        width = np.ptp(self.state_range_, axis=0)
+        return Limits(clip, centre, DIVERGENCE_RANGES * np.where(width > 0, width, 1.0))
 
     def _input_rows(self, query: Query, source: str, policy: Any, *, copies: int) -> InputRows:
         """Rows of inputs at each step of a roll-out; only known signals and actions enter."""

@@ -6,6 +6,7 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.utils import Tags
 
 from trajlearn._persistence import SaveMixin
 from trajlearn._sklearn import fit_context
@@ -28,6 +29,16 @@ class EpisodeForecaster(SaveMixin, Forecaster):
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {}
 
+    def __sklearn_tags__(self) -> Tags:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.two_d_array = False
+        return tags
+
+    @property
+    def learns(self) -> bool:
+        """Whether episodes other than the one that is forecast change the forecast."""
+        return type(self)._learn is not EpisodeForecaster._learn
+
     @fit_context(prefer_skip_nested_validation=True)
     def fit(self, X: Any, y: None = None, *, groups: Any = None) -> Self:
         """Fit on episodes.
@@ -35,24 +46,30 @@ class EpisodeForecaster(SaveMixin, Forecaster):
         Parameters
         ----------
         X : TrajectoryDataset or list of Trajectory
-        y, groups : None
+        y : None
+            Must be omitted.
+        groups : array-like, optional
             Ignored.
 
         Returns
         -------
         self
         """
+        if y is not None:
+            raise ValueError("y must be omitted: the targets come from the episodes themselves.")
         ds = as_dataset(X)
         self._learn_ranges_of(ds)
         self._learn(ds)
         return self
 
-    def predict(self, X: Any, **settings: Any) -> Forecast:
+    def predict(self, X: Any, return_std: bool = False, **settings: Any) -> Forecast:
         """Forecast episodes.
 
         Parameters
         ----------
         X : TrajectoryDataset or list of Trajectory
+        return_std : bool, default=False
+            These forecasters have no standard deviation to give.
         **settings
             As in `forecast`.
 
@@ -60,7 +77,7 @@ class EpisodeForecaster(SaveMixin, Forecaster):
         -------
         Forecast
         """
-        return self.forecast(X, **settings)
+        return self.forecast(X, return_std=return_std, **settings)
 
     def score(self, X: Any, y: None = None, sample_weight: Any = None) -> float:
         """Minus the range-normalised squared error, averaged over horizon and episodes.
@@ -200,6 +217,11 @@ class ReferenceForecaster(CurveForecaster):
 
     def __init__(self, state_of: Callable[[Floats], Any]) -> None:
         self.state_of = state_of
+
+    @property
+    def learns(self) -> bool:
+        """The reference of an episode is its own."""
+        return False
 
     def _learn(self, ds: TrajectoryDataset) -> None:
         # its only duty is to fail early
@@ -375,7 +397,7 @@ class MeanEpisodeForecaster(CurveForecaster):
         """Time at which the phase of each episode is zero."""
         origin = ds.time_origin
         if not self.has_origin_:
-            return ds.times[ds.offsets[:-1]]
+            return np.where(np.isfinite(origin), origin, ds.times[ds.offsets[:-1]])
         if np.isnan(origin).any():
             raise MissingFieldError(
                 f"episode {ds.ids[np.isnan(origin)][0]} has no time_origin, so its phase is "

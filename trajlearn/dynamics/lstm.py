@@ -66,7 +66,9 @@ class LSTMRegressor(RollingEstimator):
         Learn s_{t+1} - s_t, or s_{t+1} itself.
     baseline : {"mean", None}, callable or forecaster, default=None
         What states are relative to, as in `TrajectoryRegressor`: a callable of the references
-        makes it a model of the tracking error. A policy still gets the states themselves.
+        makes it a model of the tracking error. The references (for another baseline, its states)
+        have to be among the inputs, as they are with ``inputs="params"``. A policy still gets
+        the states themselves; `clip_states` is about the deviation.
     policy : callable or None, default=None
         ``policy(states (n, d_s), params (n, p), times (n,)) -> actions (n, d_a)``, for roll-outs.
     rollout_actions : {"auto", "logged", "policy"}, default="auto"

@@ -128,7 +128,8 @@ class BlockScaler(TransformerMixin, BaseEstimator):
         ``features(states (n, d_s), params (n, p)) -> (n, k)``: what is known to matter, such as
         the control error, computed from the unscaled rows. The k columns follow all blocks,
         scaled to mean 0 and variance 1. Row i may depend on row i only; p = 0 where rows hold no
-        params. It is called for predicted states, too, and has to be finite there.
+        params. It is called for predicted states, too, and has to be finite there. Under an
+        estimator with a `baseline` states are relative to it.
 
     Attributes
     ----------

@@ -67,7 +67,8 @@ class TrajectoryRegressor(DynamicsEstimator):
         the paper. A callable ``state_of(references (m, d_r)) -> (m, d_s)``: the reference, see
         `ReferenceForecaster`. "mean": the mean episode at that phase, see
         `MeanEpisodeForecaster`. An estimator with ``fit(ds)`` and ``predict(ds) -> Forecast``:
-        its forecast from the first state. One that learns is fitted inside, and predicts each
+        its forecast from the first state of the episode (so that it matters where an episode
+        begins), to the end of the log. One that learns is fitted inside, and predicts each
         training episode out of fold; ``FrozenEstimator(fitted)`` is taken as it is.
     gate : float or None, default=0.05
         Time constant of the gate as a fraction of the longest horizon; None for no gate.
@@ -224,23 +225,26 @@ class TrajectoryRegressor(DynamicsEstimator):
     def _learn_scale(self, rows: Floats, targets: Floats, weight: Floats | None) -> None:
         """Scale of what is predicted: the state, its change, or its deviation from the baseline."""
         largest = np.abs(targets).max(axis=0)
-        change = self.baseline is not None and self.baseline_ is None
+        # the fitted model goes by what it was fitted with, whatever the parameters become
+        self._gate_time = self.gate if self.baseline is not None else None
+        self._anchored = self.baseline is not None
+        change = self._anchored and self.baseline_ is None
         start = rows[:, self.layout_["state"]] if change else 0.0
         self.target_scale_ = spread(targets - start, largest, weight)
 
     def _anchor(self, rows: Floats, gate: Floats) -> Floats | float:
         """Where a prediction is while the gate is shut: at the start, or leaving it."""
-        if self.baseline is None:
+        if not self._anchored:
             return 0.0
         start = rows[:, self.layout_["state"]]
         return start if self.baseline_ is None else (1 - gate) * start
 
     def _gate(self, rows: Floats) -> Floats:
         """g(h) of each row (n, 1); not quite 0 at h = 0, since targets are divided by it."""
-        if self.gate is None or self.baseline is None:
+        if self._gate_time is None:
             return np.ones((len(rows), 1))
         horizon = np.abs(rows[:, self.layout_["horizon"]])
-        gate = -np.expm1(-horizon / (self.gate * (self.max_horizon_ or 1.0)))
+        gate = -np.expm1(-horizon / (self._gate_time * (self.max_horizon_ or 1.0)))
         return np.maximum(gate, 1e-3)
 
     def _learning_targets(self, rows: Floats, targets: Floats) -> tuple[Floats, Floats | None]:
@@ -377,7 +381,7 @@ class TrajectoryRegressor(DynamicsEstimator):
         gate = gate.reshape(*horizons.shape, 1)
         scale = gate * self.target_scale_
         anchor: Floats | float = 0.0
-        if self.baseline is not None:
+        if self._anchored:
             start_states = query.initial_states[some, None]
             anchor = start_states if self.baseline_ is None else (1 - gate) * start_states
         return anchor + scale * means, scale**2 * variances

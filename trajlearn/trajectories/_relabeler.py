@@ -1,5 +1,6 @@
 """What the relabelers share: imbalanced-learn's ``fit_resample`` protocol, blocks and layout."""
 
+import warnings
 from abc import abstractmethod
 from typing import Any, ClassVar, Self
 
@@ -78,6 +79,14 @@ class Relabeler(BaseEstimator):
     def _chosen(self, ds: TrajectoryDataset) -> tuple[str, ...]:
         """Blocks named by `inputs`, or every block that the episodes have."""
         if self.inputs is None:
+            known = np.isfinite(ds.time_origin)
+            if "phase" in self._blocks and known.any() and not known.all():
+                warnings.warn(
+                    f"{int((~known).sum())} of {len(ds)} episodes have no time_origin, so the "
+                    "phase is no input. Leave them out, or align them; or choose inputs= without "
+                    "'phase' to say that this is meant.",
+                    stacklevel=4,
+                )
             return tuple(block for block in self._blocks if has_block(ds, block))
         return tuple(self.inputs)
 

@@ -255,7 +255,8 @@ def assign(ds: TrajectoryDataset, **fields: Any) -> TrajectoryDataset:
         ``rewards``, ``params``, ``references``, ``times``, ``time_origin``, ``context``,
         ``group``, ``terminated``, ``ids``, and the names of columns. None removes a field.
         ``params`` of shape (p,) and ``context`` values that are no lists are meant for all
-        episodes. Names stay where the number of columns does.
+        episodes; ``context`` replaces all that there is. Names stay where the number of columns
+        does.
 
     Returns
     -------
@@ -279,7 +280,10 @@ def assign(ds: TrajectoryDataset, **fields: Any) -> TrajectoryDataset:
     """
     unknown = set(fields) - _ASSIGNABLE
     if unknown:
-        raise TypeError(f"assign got {sorted(unknown)}; it takes {sorted(_ASSIGNABLE)}.")
+        raise TypeError(
+            f"assign got {sorted(unknown)}; it takes {sorted(_ASSIGNABLE)}. Other states are other "
+            "episodes: build them with from_arrays."
+        )
     kept: dict[str, Any] = {
         name: getattr(ds, name) for name in ("time_origin", "context", "group", "terminated", "ids")
     }
@@ -288,7 +292,12 @@ def assign(ds: TrajectoryDataset, **fields: Any) -> TrajectoryDataset:
     kept["params"] = [e.params for e in ds] if ds.params_vary else ds.params
     new = dict(fields)
     params = new.get("params")
-    if params is not None and not _ragged(params) and np.ndim(params) == 1:
+    if params is not None and not _ragged(params) and np.ndim(params) < 2:
+        if np.shape(params) != (len(ds.param_names),) and ds.has_params:
+            raise InvalidEpisodeError(
+                f"params has shape {np.shape(params)}: give {len(ds.param_names)} for all episodes "
+                f"({', '.join(ds.param_names)}), or {len(ds)} rows of them."
+            )
         new["params"] = np.tile(np.asarray(params, dtype=np.float64), (len(ds), 1))
     for key, values in (new.get("context") or {}).items():
         if np.ndim(values) == 0:
