@@ -89,3 +89,5 @@ def pytest_terminal_summary(terminalreporter: Any) -> None:
     if ran or skipped:
         reason = f" (no folder {_DATA})" if skipped else ""
         terminalreporter.write_line(f"data tests: {len(ran)} ran, {len(skipped)} skipped{reason}")
+    else:
+        terminalreporter.write_line("data tests: none selected")

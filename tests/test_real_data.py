@@ -69,6 +69,12 @@ def test_with_data_a_skip_is_a_failure(run, tmp_path):
     assert "test_gives_up was skipped although its data are in" in done.stdout
 
 
+def test_a_run_without_any_says_so(run):
+    done = run("-k", "test_other")
+    assert done.returncode == 0
+    assert "data tests: none selected" in done.stdout.splitlines()
+
+
 def test_a_folder_that_was_named_must_be_there(run, tmp_path):
     done = run(TRAJLEARN_TEST_DATA=str(tmp_path / "nowhere"))
     assert done.returncode == 1

@@ -137,10 +137,10 @@ def estimator_of(model: str, settings: str, *, mode: str, seed: int) -> Any:
 
 
 def state_of(references: NDArray[np.float64]) -> NDArray[np.float64]:
-    """All twelve states of a craft on its set-point, level and at rest; yaw from degrees."""
+    """All twelve states of a craft on its set-point, level and at rest."""
     states = np.zeros((len(references), len(STATES["all"])))
     states[:, :3] = references[:, :3]
-    states[:, STATES["all"].index("yaw")] = np.deg2rad(references[:, 3])
+    states[:, STATES["all"].index("yaw")] = references[:, 3]
     return states
 
 

@@ -21,7 +21,7 @@ def synthetic(n_steps=70):
     for speed in (1.0, 1.2, 1.4):
         wave = np.sin(speed * times[:, None] * np.arange(1, 13))
         states.append(wave)
-        references.append(np.c_[wave[:, :3], np.rad2deg(wave[:, 8])])
+        references.append(np.c_[wave[:, :3], wave[:, 8]])
     flights = ["pid_rep1", "pid_rep2", "pid_rep3"]
     return TrajectoryDataset.from_arrays(
         states,
@@ -125,13 +125,13 @@ def test_errors_are_those_of_the_forecast(recorded):
 
 
 def test_the_reference_is_a_state():
-    states = _trefoil.state_of(np.array([[1.0, 2.0, 3.0, 180.0]]))
+    states = _trefoil.state_of(np.array([[1.0, 2.0, 3.0, 0.5]]))
     names = _trefoil.STATES["all"]
     assert dict(zip(names, states[0])) == dict.fromkeys(names, 0.0) | {
         "x": 1.0,
         "y": 2.0,
         "z": 3.0,
-        "yaw": np.pi,
+        "yaw": 0.5,
     }
 
 

@@ -1,7 +1,9 @@
 """Flights with gains: from synthetic logs of known content, and the real tables."""
 
 import hashlib
+import lzma
 import time
+import tracemalloc
 
 import numpy as np
 import pandas as pd
@@ -180,7 +182,9 @@ def test_a_log_that_lacks_a_variable_is_left_out_and_named(source, tmp_path):
     write_log(tmp_path / "logs" / "log21", values, T)
     write_gains(tmp_path, "21")
     write_log(tmp_path / "logs" / "log22", values, T)
-    with pytest.warns(UserWarning, match=f"2 of 3 logs are left out; .*{message}"):
+    with pytest.warns(
+        UserWarning, match=rf"2 of 3 logs are left out \(log20, log22\); .*{message}"
+    ):
         ds = load_crazyflie_gains(tmp_path)
     assert ds.ids.tolist() == ["log21"]
 
@@ -206,6 +210,81 @@ def test_other_events_and_times_that_go_back_are_refused(tmp_path):
     write_log(path, signals(T, start=0.5), back)
     with pytest.raises(UnknownFileError, match="times that go back"):
         decode_flight(path, 0.02)
+
+
+@pytest.fixture
+def three(tmp_path):
+    """A folder with three sound flights, of which a test spoils log21."""
+    for name, start in (("20", 0.5), ("21", 0.6), ("22", 0.7)):
+        write_log(tmp_path / "logs" / f"log{name}", signals(T, start=start), T)
+        write_gains(tmp_path, name)
+    return tmp_path
+
+
+def flip_a_bit(folder):
+    path = folder / "logs" / "log21"
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0x40
+    path.write_bytes(content)
+
+
+def lose_a_value(folder):
+    values = signals(T, start=0.6)
+    values["ctrlLee.torquex"][500] = np.nan
+    write_log(folder / "logs" / "log21", values, T)
+
+
+def stall(folder, seconds=1.0):
+    keep = (T < 2) | (2 + seconds <= T)
+    values = {name: x[keep] for name, x in signals(T, start=0.6).items()}
+    write_log(folder / "logs" / "log21", values, T[keep])
+
+
+def garble_the_gains(folder):
+    (folder / "info" / "info21.yaml").write_bytes(b"\xff\xfe\x00bad")
+
+
+def make_a_gain_infinite(folder):
+    path = folder / "info" / "info21.yaml"
+    path.write_text(path.read_text() + "KR_x: inf\nKw_z: nan\n")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (flip_a_bit, r"log21, byte \d+: .*damaged"),
+        (lose_a_value, "log21 has missing or infinite values of ctrlLee.torquex"),
+        (stall, r"log21 has no samples for 1\.0\d s after (1\.99|2\.00) s of flight"),
+        (garble_the_gains, r"info21\.yaml is not UTF-8 text"),
+        (make_a_gain_infinite, r"info21\.yaml has no finite number for KR_x, Kw_z"),
+    ],
+    ids=["bit", "nan", "stall", "text", "gain"],
+)
+def test_a_bad_flight_is_left_out_and_named(three, spoil, message):
+    spoil(three)
+    with pytest.warns(
+        UserWarning, match=rf"1 of 3 logs are left out \(log21\); the first: .*{message}"
+    ):
+        ds = load_crazyflie_gains(three)
+    assert ds.ids.tolist() == ["log20", "log22"]
+
+
+def test_a_log_whose_end_was_lost_and_a_short_gap_are_read(three):
+    path = three / "logs" / "log20"
+    path.write_bytes(path.read_bytes()[:-1000])
+    stall(three, 0.08)
+    with pytest.warns(UserWarning, match="log20 has no valid checksum: reading") as caught:
+        ds = load_crazyflie_gains(three)
+    assert len(caught) == 1
+    assert ds.ids.tolist() == ["log20", "log21", "log22"]
+    assert ds.lengths[0] < ds.lengths[1] == ds.lengths[2]
+
+
+def test_only_kinds_that_were_asked_for_must_log_the_whole_motion(three):
+    write_log(three / "logs" / "log21", signals(T, start=-0.5, kind="figure8"), T)
+    assert load_crazyflie_gains(three, kinds="line_y").ids.tolist() == ["log20", "log22"]
+    with pytest.raises(ValueError, match=r"flights of kind 'figure8' cannot .* the whole motion"):
+        load_crazyflie_gains(three)
 
 
 @pytest.fixture
@@ -239,6 +318,26 @@ def test_a_changed_table_is_refused(tables, name):
         path.write_bytes(data.replace(b"0.0375", b"0.0376", 1))
     with pytest.raises(UnknownFileError, match=f"{name} (was changed|is not a sound .xz)"):
         load_crazyflie_gains(tables)
+
+
+@pytest.mark.parametrize("name", list(crazyflie._SHA256))
+def test_a_table_is_unpacked_up_to_a_bound_only(tables, name, monkeypatch):
+    monkeypatch.setattr(crazyflie, "_MAX_BYTES", 2_000_000)
+    load_crazyflie_gains(tables)
+    monkeypatch.setattr(crazyflie, "_MAX_BYTES", 1000 if name == "flights.csv" else 500_000)
+    if name == "flights.csv":
+        with (tables / name).open("r+b") as handle:
+            handle.truncate(100_000_000)
+    else:
+        bomb = lzma.compress(bytes(100_000_000), preset=0)
+        assert len(bomb) < 500_000
+        (tables / name).write_bytes(bomb)
+    tracemalloc.start()
+    with pytest.raises(UnknownFileError, match=f"{name} is another file: .* more than"):
+        load_crazyflie_gains(tables)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 10_000_000
 
 
 def test_downloads_come_from_the_fixed_commit(source, tmp_path, monkeypatch):

@@ -12,7 +12,10 @@ import tarfile
 import threading
 import tracemalloc
 import zlib
+from email.message import Message
 from types import SimpleNamespace
+from urllib.error import HTTPError
+from urllib.request import Request
 
 import numpy as np
 import pytest
@@ -152,6 +155,40 @@ def test_files_arrive_and_a_second_call_asks_for_nothing(server, folder):
     fetch(files, folder)
     fetch(files, folder, download_if_missing=False)
     assert len(server.asked) == 5
+
+
+@pytest.mark.parametrize(
+    ("source", "target", "followed"),
+    [
+        ("https://a.org/1", "https://b.org/2", True),
+        ("https://a.org/1", "http://a.org/1", False),
+        ("https://a.org/1", "ftp://a.org/1", False),
+        ("http://a.org/1", "http://b.org/2", True),
+        ("http://a.org/1", "https://b.org/2", True),
+    ],
+)
+def test_no_redirect_leaves_an_encrypted_connection(source, target, followed):
+    handler, request = _fetch._StaysEncrypted(), Request(source)
+    handler.parent = SimpleNamespace(open=lambda asked, timeout=None: asked.full_url)
+    request.timeout, headers = 1.0, Message()
+    headers["Location"] = target
+    if followed:
+        assert handler.http_error_302(request, io.BytesIO(), 302, "Found", headers) == target
+    else:
+        with pytest.raises(HTTPError, match=f"redirects to {target}, not encrypted: refused"):
+            handler.http_error_302(request, io.BytesIO(), 302, "Found", headers)
+
+
+def test_downloads_ask_the_handler_of_redirects(server, folder, monkeypatch):
+    def refuse(handler, request, *rest):
+        raise HTTPError(request.full_url, 302, "refused", None, None)
+
+    monkeypatch.setattr(_fetch._StaysEncrypted, "redirect_request", refuse)
+    url = server.url("1", redirect(server.url("2", send(BODY))))
+    with pytest.raises(OSError, match=r"refused; attempt 1 of 4"):
+        fetch([remote(url)], folder)
+    assert server.asked == ["/1"]
+    assert everything(folder) == ["flights"]
 
 
 def test_the_file_has_the_permissions_of_any_new_file(server, folder, tmp_path):

@@ -68,7 +68,9 @@ def test_each_column_reaches_its_place_and_the_ends_are_cut(logs, tmp_path):
     motors = [f"motor_motor_m{i}" for i in range(1, 5)]
     np.testing.assert_array_equal(episode.actions, table[motors].to_numpy()[:-1])
     targets = [f"sp_ctrltarget_{axis}" for axis in ("x", "y", "z", "yaw")]
-    np.testing.assert_array_equal(episode.references, table[targets].to_numpy())
+    expected = table[targets].to_numpy() * [1, 1, 1, np.pi / 180]
+    np.testing.assert_allclose(episode.references, expected, rtol=1e-12)
+    assert ds.reference_names == ("rx", "ry", "rz", "ryaw")
     assert ds.ids.tolist() == ds.group.tolist() == ["pid_rep1", "pid_rep2", "pid_rep3"]
     assert ds.time_origin.tolist() == [0, 0, 0]
     assert not ds.has_params

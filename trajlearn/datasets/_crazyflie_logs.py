@@ -32,6 +32,7 @@ _EVENT = "fixedFrequency"
 _LAST_EXPERIMENT = 200  # what comes later has another mass and another task
 _LAST_UPGRADED = 145  # says the source's own description
 _FIRST_STEPS = 10  # the card stalls once, some 16 ms after the start
+_MAX_GAP_S = 0.1  # samples are 4 ms apart, in the source 24 ms at most
 
 
 def read_crazyflie_logs(folder: Path, dt: float) -> tuple["pd.DataFrame", "pd.DataFrame"]:
@@ -62,7 +63,7 @@ def read_crazyflie_logs(folder: Path, dt: float) -> tuple["pd.DataFrame", "pd.Da
         for path in (folder / "logs").iterdir()
         if (match := re.fullmatch(r"log(\d+)(_.*)?", path.name))
     }
-    rows, tables, problems = [], [], []
+    rows, tables, problems = [], [], {}
     for path in sorted(paths, key=lambda path: (paths[path], path.name)):
         if paths[path] > _LAST_EXPERIMENT:
             continue
@@ -72,7 +73,7 @@ def read_crazyflie_logs(folder: Path, dt: float) -> tuple["pd.DataFrame", "pd.Da
             )
             flight = decode_flight(path, dt)
         except UnknownFileError as error:
-            problems.append(str(error))
+            problems[path.name] = str(error)
             continue
         rows.append({"flight": path.name, "experiment": paths[path], **_facts(flight), **gains})
         rows[-1]["motors"] = "upgraded" if paths[path] <= _LAST_UPGRADED else "standard"
@@ -80,12 +81,12 @@ def read_crazyflie_logs(folder: Path, dt: float) -> tuple["pd.DataFrame", "pd.Da
         tables.append(flight)
     if not rows:
         raise UnknownFileError(
-            f"{folder / 'logs'} has no log that can be read. {problems[0] if problems else ''}"
+            f"{folder / 'logs'} has no log that can be read. {next(iter(problems.values()), '')}"
         )
     if problems:
         warnings.warn(
-            f"{len(problems)} of {len(problems) + len(rows)} logs are left out; the first: "
-            f"{problems[0]}",
+            f"{len(problems)} of {len(problems) + len(rows)} logs are left out "
+            f"({', '.join(problems)}); the first: {next(iter(problems.values()))}",
             stacklevel=4,
         )
     return pd.DataFrame(rows), pd.concat(tables, ignore_index=True)
@@ -97,7 +98,8 @@ def decode_flight(path: Path, dt: float) -> "pd.DataFrame":
     Raises
     ------
     UnknownFileError
-        If the file is no log, or lacks variables; the message names them and those it has.
+        If the file is no log or was damaged, lacks variables (the message names them and those
+        it has), has missing values, or a gap in mid-flight: nobody knows what happened there.
     """
     import pandas as pd
 
@@ -118,12 +120,22 @@ def decode_flight(path: Path, dt: float) -> "pd.DataFrame":
             f"{path} has {len(times)} samples or times that go back: leave it out."
         )
     first = int(np.argmax(steps[:_FIRST_STEPS])) + 1
+    gap = int(np.argmax(steps[first:])) + first
+    if steps[gap] > _MAX_GAP_S:
+        raise UnknownFileError(
+            f"{path} has no samples for {steps[gap]:.2f} s after {times[gap] - times[first]:.2f} s "
+            "of flight: leave it out."
+        )
     times = times[first:] - times[first]
     # Round-off must not cost the last sample.
     grid = dt * np.arange(int(times[-1] / dt + 1e-6) + 1)
     columns = {"t": grid}
     for column, (name, unit) in _VARIABLES.items():
         values = unit * variables[name][first:].astype(np.float64)
+        if not np.isfinite(values).all():
+            raise UnknownFileError(
+                f"{path} has missing or infinite values of {name}: leave it out."
+            )
         values = np.unwrap(values) if column in ("roll", "pitch", "yaw") else values
         columns[column] = np.interp(grid, times, values)
     return pd.DataFrame(columns)
@@ -152,8 +164,16 @@ def _read_gains(path: Path) -> dict[str, float]:
     """The gains and the mass, from a file of lines ``name: value``."""
     if not path.is_file():
         raise UnknownFileError(f"{path} is missing: it has the gains of the flight.")
-    entries = dict(line.split(":", 1) for line in path.read_text().splitlines() if ":" in line)
     try:
-        return {name: float(entries[name]) for name in ("mass", *GAINS)}
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise UnknownFileError(f"{path} is not UTF-8 text ({error}): copy it again.") from None
+    entries = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
+    try:
+        gains = {name: float(entries[name]) for name in ("mass", *GAINS)}
     except (KeyError, ValueError) as error:
         raise UnknownFileError(f"{path} lacks a gain or has no number there: {error}.") from None
+    infinite = [name for name, value in gains.items() if not np.isfinite(value)]
+    if infinite:
+        raise UnknownFileError(f"{path} has no finite number for {', '.join(infinite)}.")
+    return gains

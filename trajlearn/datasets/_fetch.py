@@ -14,8 +14,10 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 from urllib.error import HTTPError, URLError
-from urllib.request import Request, urlopen
+from urllib.parse import urlsplit
+from urllib.request import HTTPRedirectHandler, Request, build_opener
 
 from tqdm import tqdm
 
@@ -258,11 +260,31 @@ def _download(
         )
 
 
+class _StaysEncrypted(HTTPRedirectHandler):
+    """Follows no redirect from an encrypted connection to another, which anyone could answer."""
+
+    def redirect_request(
+        self,
+        req: Request,
+        fp: IO[bytes],
+        code: int,
+        msg: str,
+        headers: http.client.HTTPMessage,
+        newurl: str,
+    ) -> Request | None:
+        if req.type == "https" and urlsplit(newurl).scheme != "https":
+            raise HTTPError(
+                req.full_url, code, f"it redirects to {newurl}, not encrypted: refused", headers, fp
+            )
+        return super().redirect_request(req, fp, code, msg, headers, newurl)
+
+
 def _stream(url: str, path: Path, verbose: int) -> str:
     """Write the body of the answer to `path`; return its SHA-256."""
     digest, n_bytes = hashlib.sha256(), 0
     request = Request(url, headers={"User-Agent": "trajlearn"})
-    with urlopen(request, timeout=_TIMEOUT_S) as response, path.open("wb") as handle:
+    opener = build_opener(_StaysEncrypted)
+    with opener.open(request, timeout=_TIMEOUT_S) as response, path.open("wb") as handle:
         announced = response.length
         with tqdm(
             desc=url.rpartition("/")[2],

@@ -26,7 +26,11 @@ def require_folder(path: str | Path) -> Path:
     return folder
 
 
-def read_checked(path: Path, sha256: str) -> bytes:
+# Of the decompressor; what `xz -9` packed needs 65 MiB.
+_MAX_MEMORY = 128 << 20
+
+
+def read_checked(path: Path, sha256: str, max_bytes: int) -> bytes:
     """The content of a file, uncompressed if its name ends in ``.xz``.
 
     Parameters
@@ -34,19 +38,31 @@ def read_checked(path: Path, sha256: str) -> bytes:
     path : Path
     sha256 : str
         Of the uncompressed content.
+    max_bytes : int
+        More than the content has: a file that has more is not read, or unpacked, to its end.
 
     Raises
     ------
     UnknownFileError
         If the content is another.
     """
-    content = path.read_bytes()
-    try:
-        content = lzma.decompress(content) if path.suffix == ".xz" else content
-    except lzma.LZMAError as error:
+    with path.open("rb") as handle:
+        content = handle.read(max_bytes + 1)
+    if path.suffix == ".xz" and len(content) <= max_bytes:
+        unpack = lzma.LZMADecompressor(memlimit=_MAX_MEMORY)
+        try:
+            content = unpack.decompress(content, max_bytes + 1)
+            if not unpack.eof and len(content) <= max_bytes:
+                raise lzma.LZMAError("it ends too early")
+        except lzma.LZMAError as error:
+            raise UnknownFileError(
+                f"{path} is not a sound .xz file ({error}): copy it again."
+            ) from None
+    if len(content) > max_bytes:
         raise UnknownFileError(
-            f"{path} is not a sound .xz file ({error}): copy it again."
-        ) from None
+            f"{path} is another file: it has more than {max_bytes} bytes, packed or unpacked. "
+            "Copy it again."
+        )
     found = hashlib.sha256(content).hexdigest()
     if found != sha256:
         raise UnknownFileError(

@@ -11,6 +11,7 @@ from trajlearn.datasets._crazyflie_logs import GAINS, read_crazyflie_logs
 from trajlearn.datasets._fetch import fetch_archive, get_data_home
 from trajlearn.datasets._local import read_checked, require_folder
 from trajlearn.datasets.alignment import align_references
+from trajlearn.exceptions import InvalidEpisodeError
 from trajlearn.trajectories.dataset import TrajectoryDataset
 
 if TYPE_CHECKING:
@@ -25,6 +26,8 @@ _SHA256 = {
     "flights.csv": "a4741b05816bb9a2f730085fe1c7f083ba0214828413ea2c306c1ba254c2f99b",
     "flights_50hz.csv.xz": "df37e65b2603c7f75770f5994c63ffaab3692b745de0debce53cd5fa06cc720f",
 }
+# unpacked; the larger table has 10 MB
+_MAX_BYTES = 40 << 20
 _KINDS = ("line_x", "line_y", "figure8", "hover")
 _STATES = ("x", "y", "z", "vx", "vy", "vz", "roll", "pitch", "yaw", "wx", "wy", "wz")
 _ACTIONS = ("thrust", "tx", "ty", "tz")
@@ -91,7 +94,9 @@ def load_crazyflie_gains(
         What was flown: "line_x", "line_y", "figure8", "hover"; default all.
     clean : bool, default=True
         Leave out flights that were logged with take-off and landing, and those that crashed,
-        tumbled, turned faster than 5 rad/s or strayed more than 0.6 m.
+        tumbled, turned faster than 5 rad/s or strayed more than 0.6 m. The latter selects by the
+        outcome: what is left are the survivors, and what is learned from them is silent about
+        gains that crash. Pass False to see all, with the facts of each in `info`.
     other_time_scales : bool, default=False
         Keep the few flights that flew the path of their kind at another speed.
     return_info : bool, default=False
@@ -127,7 +132,7 @@ def load_crazyflie_gains(
         A derived table was changed, or no log can be read.
     ValueError
         `path` has neither tables nor logs, a kind is unknown, no flight is left, or no flight of a
-        kind logs the whole motion (in parts of the source only).
+        kind asked for logs the whole motion (in parts of the source only).
     OSError
         If the source cannot be downloaded.
 
@@ -136,7 +141,8 @@ def load_crazyflie_gains(
     Source: Intelligent Multi-Robot Coordination Lab, TU Berlin,
     https://github.com/IMRCLab/crazyswarm2-tools, MIT licence, commit 847605a. From its binary logs
     everything up to the stall of the card at their beginning is dropped and the rest interpolated
-    linearly. The derived tables hold four fifths of the experiments, those of the source all.
+    linearly; logs that were damaged, lack values, or stall again for more than 0.1 s are left out
+    with a warning. The derived tables hold four fifths of the experiments, those of the source all.
     Kinds are judged by the logged reference: the labels of the source are wrong for many flights.
     The names and units of the logged variables are those of the source's plot settings; this
     package's decoding is tested on logs of known content, not on those of the source.
@@ -146,6 +152,8 @@ def load_crazyflie_gains(
     >>> ds, info = load_crazyflie_gains(path, kinds="line_y", return_info=True)  # doctest: +SKIP
     >>> ds[~info["violent"].to_numpy()]  # doctest: +SKIP
     """
+    import pandas as pd
+
     wanted = _KINDS if kinds is None else (kinds,) if isinstance(kinds, str) else tuple(kinds)
     unknown = [kind for kind in wanted if kind not in _KINDS]
     if unknown or not wanted:
@@ -159,9 +167,10 @@ def load_crazyflie_gains(
         )
     flights, samples = _read_tables(require_folder(path))
     flights = flights.set_index("flight").sort_values("experiment", kind="stable")
+    flights = flights[flights["kind"].isin(wanted)]
     rows = {str(flight): table for flight, table in samples.groupby("flight", sort=False)}
     info = _describe(flights, rows)
-    keep = info["kind"].isin(wanted)
+    keep = pd.Series(True, index=info.index)
     if clean:
         keep &= info["airborne_only"] & ~info["suspect"]
     if not other_time_scales:
@@ -196,7 +205,7 @@ def _read_tables(folder: Path) -> tuple["pd.DataFrame", "pd.DataFrame"]:
 
     if (folder / "flights.csv").is_file():
         flights, samples = (
-            pd.read_csv(io.BytesIO(read_checked(folder / name, sha256)))
+            pd.read_csv(io.BytesIO(read_checked(folder / name, sha256, _MAX_BYTES)))
             for name, sha256 in _SHA256.items()
         )
         return flights, samples
@@ -217,11 +226,17 @@ def _describe(flights: "pd.DataFrame", rows: dict[str, "pd.DataFrame"]) -> "pd.D
         if kind == "hover":
             continue
         parts = [rows[name] for name in names]
-        found = align_references(
-            [part["t"].to_numpy() for part in parts],
-            [part[["rx", "ry"]].to_numpy() for part in parts],
-            [part[["rvx", "rvy"]].to_numpy() for part in parts],
-        )
+        try:
+            found = align_references(
+                [part["t"].to_numpy() for part in parts],
+                [part[["rx", "ry"]].to_numpy() for part in parts],
+                [part[["rvx", "rvy"]].to_numpy() for part in parts],
+            )
+        except InvalidEpisodeError as error:
+            raise InvalidEpisodeError(
+                f"flights of kind {kind!r} cannot be aligned: {error} Or leave this kind out of "
+                "kinds."
+            ) from None
         info.loc[names, "time_origin"] = found.time_origin
         info.loc[names, "time_scale"] = found.time_scale
         info.loc[names, "residual"] = found.residual

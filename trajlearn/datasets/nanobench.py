@@ -37,6 +37,8 @@ _SHA256 = {
         "405768be217cd69a6c4b5728a2e7e6a17d0018c0ed813aaba7cfe20a93a1f22d",
     ),
 }
+# of a file, unpacked; each has 1.3 MB
+_MAX_BYTES = 8 << 20
 _STATES = {
     "x": "px",
     "y": "py",
@@ -96,7 +98,7 @@ def load_nanobench_trefoil(
         - states (12): x y z [m], vx vy vz [m/s], roll pitch yaw [rad, yaw without jumps],
           wx wy wz [rad/s], all from motion capture (smoothed by the source);
         - actions (4): m1 ... m4, PWM of the motors, 0 to 65535;
-        - references (4): rx ry rz [m] and ryaw [deg], the set-point, as the radio brought it: it
+        - references (4): rx ry rz [m] and ryaw [rad], the set-point, as the radio brought it: it
           lags and jumps by some samples, differently in each flight;
         - context ``controller``; group and ids: the flight (windows: ``<flight>:<start>``);
         - times [s] and time_origin: since the log began, at take-off.
@@ -114,7 +116,8 @@ def load_nanobench_trefoil(
     -----
     Source: S. I. Ullah and J. Baca, NanoBench, arXiv:2603.09908,
     https://github.com/syediu/nanobench-iros2026, BSD 3-Clause licence. Angles of the motion
-    capture are in radians, against what the source says.
+    capture are in radians there, against what the source says; the yaw of the set-point is in
+    degrees, and is converted.
 
     Examples
     --------
@@ -178,11 +181,12 @@ def _find(folder: Path, controller: str, file: str) -> Path:
 def _read(path: Path, sha256: str) -> dict[str, np.ndarray]:
     import pandas as pd
 
-    table = pd.read_csv(io.BytesIO(read_checked(path, sha256)))
+    table = pd.read_csv(io.BytesIO(read_checked(path, sha256, _MAX_BYTES)))
     # Unix times leave 0.2 us of round-off.
     times = np.round((table["t"] - table["t"].iloc[0]).to_numpy(), 6)
     keep = (times >= _CUT_START_S) & (times <= times[-1] - _CUT_END_S)
     table["yaw"] = np.unwrap(table["yaw"])
+    table[_REFERENCES["ryaw"]] = np.deg2rad(table[_REFERENCES["ryaw"]])
     columns = {"states": _STATES, "actions": _ACTIONS, "references": _REFERENCES}
     return {
         "times": times[keep],

@@ -22,6 +22,11 @@ from trajlearn.exceptions import UnknownFileError
 __all__ = ["UsdEvents", "read_usd_log"]
 
 _MAGIC, _CRC_BYTES, _PREAMBLE_BYTES = 0xBC, 4, 5
+_CRC_POLYNOMIAL = 0xEDB88320
+# What one wrong bit may make look like a cut lies near the end of the log.
+_SEARCHED_BYTES = 1 << 20
+# Tasks of the firmware write side by side, and no battery lasts longer.
+_MAX_STEP_BACK_S, _MAX_STEP_S = 1.0, 3600.0
 # version of the format -> how a record holds its time, and the ticks in a second
 _CLOCKS = {1: ("<u4", 1e3), 2: ("<u8", 1e6)}
 # type character -> numpy's name, of the standard sizes: "l" has four bytes
@@ -60,9 +65,12 @@ def read_usd_log(path: str | Path, *, allow_truncated: bool = False) -> dict[str
     ----------
     path : str or Path
     allow_truncated : bool, default=False
-        A log has no checksum where the power went before logging was stopped. With True, its
-        records up to the first one that is not whole are returned, with a warning. Nothing then
-        tells a cut from other damage: look at the values.
+        A log has no checksum where the power went before logging was stopped. With True, the
+        whole records of a log that ends within a record, or in zeros, are returned with a
+        warning. A log that is damaged otherwise is refused all the same: one that whole records
+        fill up to four bytes that are no checksum of them, that goes on after an unknown event,
+        whose times leap, or that a single bit makes whole. Damage of several bits within the last
+        records may still pass for a cut.
 
     Returns
     -------
@@ -143,34 +151,34 @@ def _decode(
 ) -> dict[str, UsdEvents]:
     end = len(data) - _CRC_BYTES
     whole = zlib.crc32(memoryview(data)[:end]) == struct.unpack_from("<I", data, end)[0]
-    if not whole:
-        if not allow_truncated:
-            raise _Malformed(
-                end,
-                "the checksum is missing or does not match: the log was cut off or damaged. "
-                "Copy it from the card again; if the power went while logging, "
-                "allow_truncated=True reads the records before that.",
-            )
-        end = len(data)
-    ticks = _CLOCKS[version][1]
-    kinds, start = _read_header(data, end, version, n_types)
-    if not whole:
-        # A card may hold zeros where nothing was written, and 0 is a valid id.
-        end = len(data.rstrip(b"\0"))
-    offsets, stop, problem = _find_records(data, start, end, kinds)
-    if whole and problem:
-        raise _Malformed(stop, f"{problem}. The logger wrote it so: report the file.")
-    if not whole:
-        warnings.warn(
-            f"{path} has no valid checksum: reading the {sum(map(len, offsets.values()))} "
-            f"records up to byte {stop} and leaving out {len(data) - stop} bytes.",
-            stacklevel=3,
+    if not whole and not allow_truncated:
+        raise _Malformed(
+            end,
+            "the checksum is missing or does not match: the log was cut off or damaged. "
+            "Copy it from the card again; if the power went while logging, "
+            "allow_truncated=True reads the records before that.",
         )
+    ticks = _CLOCKS[version][1]
+    kinds, start = _read_header(data, end if whole else len(data), version, n_types)
+    if whole:
+        offsets, stop, problem = _find_records(data, start, end, kinds)
+        if problem:
+            raise _Malformed(stop, f"{problem}. The logger wrote it so: report the file.")
+    else:
+        offsets, stop = _find_records_before_cut(data, start, kinds)
     raw = np.frombuffer(data, dtype=np.uint8)
-    return {
+    log = {
         kind.name: _gather(raw, np.asarray(offsets[event]), kind, ticks)
         for event, kind in kinds.items()
     }
+    if not whole:
+        _check_times(list(offsets.values()), list(log.values()))
+        warnings.warn(
+            f"{path} has no valid checksum: reading the {sum(map(len, log.values()))} "
+            f"records up to byte {stop} and leaving out {len(data) - stop} bytes.",
+            stacklevel=3,
+        )
+    return log
 
 
 def _read_header(data: bytes, end: int, version: int, n_types: int) -> tuple[dict[int, _Kind], int]:
@@ -251,6 +259,70 @@ def _find_records(
         append[event](at)
         at = following
     return offsets, at, "" if at == end else "the last record is not whole"
+
+
+def _find_records_before_cut(
+    data: bytes, start: int, kinds: dict[int, _Kind]
+) -> tuple[dict[int, "array[int]"], int]:
+    """The records of a log whose end was lost, and where the last whole one ends.
+
+    What is left of the next record, or zeros, may follow: all else is damage, and what stands
+    before it is not to be believed either.
+    """
+    end = len(data) - _CRC_BYTES
+    if not _find_records(data, start, end, kinds)[2] and any(data[end:]):
+        raise _Malformed(
+            end,
+            "whole records fill the file up to here, and the last four bytes are no checksum of "
+            "them: the log was damaged, not cut off. Copy it from the card again.",
+        )
+    # A card may hold zeros where nothing was written, and 0 is a valid id.
+    end = len(data.rstrip(b"\0"))
+    offsets, stop, problem = _find_records(data, start, end, kinds)
+    if stop + 2 <= end and _read_u16(data, stop, end) not in kinds:
+        raise _Malformed(
+            stop,
+            f"{problem}, and {end - stop} bytes follow: the log was damaged, not cut off. Copy it "
+            "from the card again.",
+        )
+    wrong = _find_wrong_bit(data)
+    if wrong is not None:
+        raise _Malformed(
+            wrong,
+            "a wrong bit: with the other value the checksum matches. Copy the log from the card "
+            "again.",
+        )
+    return offsets, stop
+
+
+def _find_wrong_bit(data: bytes) -> int | None:
+    """The byte with the one bit that would make the last four bytes the checksum of the rest.
+
+    A CRC is linear: what a wrong bit changes depends on its distance from the end alone.
+    """
+    end = len(data) - _CRC_BYTES
+    found = zlib.crc32(memoryview(data)[:end]) ^ struct.unpack_from("<I", data, end)[0]
+    change = 1
+    for back in range(8 * min(end, _SEARCHED_BYTES)):
+        change = change >> 1 ^ (_CRC_POLYNOMIAL if change & 1 else 0)
+        if change == found:
+            return end - 1 - back // 8
+    return None
+
+
+def _check_times(offsets: "list[array[int]]", events: list[UsdEvents]) -> None:
+    """Records found at a wrong place have times that leap."""
+    nothing = np.empty(0)
+    places = np.concatenate([nothing, *offsets])
+    order = np.argsort(places)
+    steps = np.diff(np.concatenate([nothing, *(some.times for some in events)])[order])
+    leaps = np.flatnonzero((steps < -_MAX_STEP_BACK_S) | (steps > _MAX_STEP_S))
+    if len(leaps):
+        raise _Malformed(
+            int(places[order][leaps[0] + 1]),
+            f"the time leaps by {steps[leaps[0]]:.3g} s: the log was damaged, not cut off. Copy "
+            "it from the card again.",
+        )
 
 
 def _gather(raw: np.ndarray, offsets: np.ndarray, kind: _Kind, ticks: float) -> UsdEvents:

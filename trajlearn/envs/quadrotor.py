@@ -1,7 +1,8 @@
 """A quadrotor that a PD controller with random gains keeps level."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import KW_ONLY, dataclass, replace
+from numbers import Real
 from typing import ClassVar, Final
 
 import numpy as np
@@ -42,6 +43,10 @@ DEPENDS_ON: Final = {
 INITIAL_RANGE: Final = np.array([0, 0, 0, 0.01, 0.01, 0.01, np.pi / 8, np.pi / 8, 0, *[0.01] * 3])
 
 
+def _is_number(value: object) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
+
+
 @dataclass(frozen=True)
 class Quadrotor(Environment):
     r"""The paper's simulated quadrotor: level a Crazyflie by PD control with random gains.
@@ -63,7 +68,8 @@ class Quadrotor(Environment):
         Standard deviation of the Gaussian noise that every step adds to each of the twelve
         states, in their units. 0.01 is the paper's; its code has 1e-4.
     p_range, d_range : tuple of two floats, default=(15, 1500) and (0, 400)
-        Ranges of the gains of both axes, PWM per rad and PWM per rad/s.
+        Ranges of the gains of both axes, PWM per rad and PWM per rad/s. Negative ones are
+        allowed: P then pushes the craft over, and D feeds its swinging.
     tilt_limit : float, default=pi / 4
         Roll or pitch beyond which an episode ends, in rad, less than pi / 2.
     airframe : Airframe
@@ -158,31 +164,35 @@ class Quadrotor(Environment):
     param_names: ClassVar[tuple[str, ...]] = ("p_pitch", "d_pitch", "p_roll", "d_roll")
 
     def __post_init__(self) -> None:
-        if not isinstance(self.states, str):
+        if isinstance(self.states, Iterable) and not isinstance(self.states, str):
             object.__setattr__(self, "states", tuple(self.states))
         names = self.states if isinstance(self.states, tuple) else STATE_SETS.get(self.states, ())
-        if not names or len(set(names)) < len(names) or not set(names) <= set(STATES):
+        known = all(name in STATES for name in names)
+        if not names or not known or len(set(names)) < len(names):
             raise ValueError(
                 f"states must be one of {list(STATE_SETS)} or a tuple of different names from "
                 f"{STATES}; got {self.states!r}."
             )
-        if not 0 <= self.noise < np.inf:
+        if not (_is_number(self.noise) and 0 <= self.noise < np.inf):
             raise ValueError(f"noise must be a finite number of at least 0; got {self.noise!r}.")
         for name in ("p_range", "d_range"):
-            bounds = np.asarray(getattr(self, name), dtype=np.float64)
+            try:
+                bounds = np.asarray(getattr(self, name), dtype=np.float64)
+            except (TypeError, ValueError):
+                bounds = np.array(np.nan)
             if bounds.shape != (2,) or not np.isfinite(bounds).all() or bounds[0] > bounds[1]:
                 raise ValueError(
                     f"{name} must be two finite numbers (low, high) with low <= high; got "
                     f"{getattr(self, name)!r}."
                 )
             object.__setattr__(self, name, tuple(bounds.tolist()))
-        if not 0 < self.tilt_limit < np.pi / 2:
+        if not (_is_number(self.tilt_limit) and 0 < self.tilt_limit < np.pi / 2):
             raise ValueError(
                 f"tilt_limit must be between 0 and pi / 2 rad; got {self.tilt_limit!r}."
             )
         if self.integrator not in ("euler", "rk4"):
             raise ValueError(f"integrator must be 'euler' or 'rk4'; got {self.integrator!r}.")
-        if not 0 < self.dt < np.inf:
+        if not (_is_number(self.dt) and 0 < self.dt < np.inf):
             raise ValueError(f"dt must be a finite number greater than 0; got {self.dt!r}.")
         _positive_integer(self.n_substeps, "n_substeps")
 
