@@ -13,6 +13,7 @@ from benchmarks.paper._audit_errors import (
     short_horizons,
     trajectory_ensembles,
 )
+from benchmarks.paper._audit_hardware import hardware
 from benchmarks.paper._audit_time import continuous_time, duels_in_time, planning
 from benchmarks.paper._claims import Claim, Sources
 
@@ -24,6 +25,7 @@ def claims(sources: Sources) -> list[Claim]:
         short_horizons(sources),
         beyond_training(sources),
         error_growth(sources),
+        hardware(sources),
         recomputed_actions(sources),
         ensembles(sources),
         trajectory_ensembles(sources),

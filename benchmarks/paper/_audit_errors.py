@@ -1,6 +1,7 @@
 """Claims about prediction errors: far ahead, at first, beyond training, by kind of model."""
 
 import numpy as np
+import pandas as pd
 
 from benchmarks.paper._claims import (
     ACTIONS,
@@ -12,17 +13,26 @@ from benchmarks.paper._claims import (
     compare_seeds,
     number,
 )
-from benchmarks.paper._tasks import TASKS
+from benchmarks.paper._tasks import QUADROTOR, TASKS
+
+#: Systems of the comparison of errors by horizon.
+SYSTEMS = (*TASKS, *QUADROTOR)
+
+
+def _by_horizon(sources: Sources) -> pd.DataFrame:
+    """Errors of all test episodes in windows of horizons, of all simulated systems."""
+    tables = sources["horizon-error"]
+    return pd.concat([tables["episodes"], tables["quadrotor-episodes"]], ignore_index=True)
 
 
 def _against_one_step(
     sources: Sources, window: str, models: str = "D PE LSTM C"
 ) -> list[Comparison]:
     """Error of every rolled-out model over that of T, task by task, in a window of horizons."""
-    episodes = sources["horizon-error"]["episodes"]
+    episodes = _by_horizon(sources)
     known = {(model, actions) for model, actions in zip(episodes["model"], episodes["actions"])}
     comparisons = []
-    for task in TASKS:
+    for task in SYSTEMS:
         some = episodes[episodes["task"] == task]
         for how, mark in SETTINGS.items():
             for actions, by in {**ACTIONS, "none": "no actions"}.items():
@@ -45,7 +55,7 @@ def _against_one_step(
 def _found(comparisons: list[Comparison], how: str, by: str) -> str:
     """The ratios of one kind of settings and actions, as a sentence says them."""
     parts = []
-    for task in TASKS:
+    for task in SYSTEMS:
         some = [one for one in comparisons if one.condition == f"{task}, {how}, {by}"]
         names = ", ".join(f"{one.what.split(' ')[0]} {number(one.estimate)}" for one in some)
         parts.append(f"{task}: {names}")
@@ -92,7 +102,7 @@ def beyond_training(sources: Sources) -> Claim:
 
 def error_growth(sources: Sources) -> Claim:
     """Growth is the error beyond the training length over that within it."""
-    episodes = sources["horizon-error"]["episodes"]
+    episodes = _by_horizon(sources)
     keys = ["task", "model", "actions", "seed"]
     middle = episodes.groupby(keys)[["long", "beyond"]].median().sort_index()
 
@@ -101,7 +111,7 @@ def error_growth(sources: Sources) -> Claim:
         return some["beyond"].to_numpy(), some["long"].to_numpy()
 
     comparisons = []
-    for task in TASKS:
+    for task in SYSTEMS:
         for how, mark in SETTINGS.items():
             comparisons.append(
                 compare_seeds(

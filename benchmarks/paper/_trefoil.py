@@ -41,8 +41,6 @@ SHOWN_EVERY = 5
 BASELINES = ["hold", "mean flight"]
 PAPER = ["D", "PE", "LSTM", "T"]
 OURS = ["T", "T, no reference", "T, tracking error", "C", "D"]
-#: Models that take a minute or more a fit: one seed.
-SLOW = ("PE", "LSTM")
 #: Models of the picture, by name and settings.
 PICTURED = [("D", "paper"), ("T", "paper"), ("T", "default")]
 
@@ -161,7 +159,7 @@ def run(run: Run) -> Tables:
         for states in STATES
         for model, settings in models(states)
         for flight in names
-        for seed in (run.seeds[:1] if model in SLOW or settings == "baseline" else run.seeds)
+        for seed in (run.seeds[:1] if settings == "baseline" else run.seeds)
     ]
     curves: dict[tuple[Any, ...], list[Any]] = {}
     by_window, predicted = [], {}

@@ -54,8 +54,7 @@ def report(tables: Tables) -> list[str]:
         "Actions are the logged PWM of the motors: there is no policy to recompute them. T (ours) "
         "and C (ours) know the reference, T (ours) also the time since take-off; models with the "
         "paper's settings know neither, and T's only input beside the state is the horizon. PE and "
-        "LSTM, which take longest, are measured on the paper's five states only, with one seed. A "
-        "curve of the "
+        "LSTM, which take longest, are measured on the paper's five states only. A curve of the "
         "figure shows at a horizon the mean since the horizon shown before: up to "
         f"{np.diff(shown_horizons(LENGTH)).max()} steps.",
         "",
