@@ -39,4 +39,4 @@ class HorizonWarning(UserWarning):
 
 
 class SmoothingWarning(UserWarning):
-    """A Kalman smoother met states that it cannot improve."""
+    """A Kalman smoother met states that it cannot improve, or a forecast smoothed ones."""

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from filterpy.common import Q_continuous_white_noise
 from filterpy.kalman import KalmanFilter
+from scipy.signal import lfilter
 from sklearn import config_context
 from sklearn.base import clone
 from sklearn.linear_model import LinearRegression
@@ -14,10 +15,11 @@ from sklearn.model_selection import GridSearchCV
 from sklearn.pipeline import make_pipeline
 
 from trajlearn.datasets import load_crazyflie_gains
-from trajlearn.dynamics import OneStepRegressor
+from trajlearn.dynamics import OneStepRegressor, TrajectoryRegressor
 from trajlearn.evaluation import cross_validate_horizons, horizon_scorer
 from trajlearn.exceptions import MixedSamplingError, SmoothingWarning
-from trajlearn.trajectories import TrajectoryDataset
+from trajlearn.trajectories import TrajectoryDataset, _kalman_blocks
+from trajlearn.trajectories._kalman_blocks import _chunks
 from trajlearn.trajectories.kalman import KalmanSmoother, StateSpaceModel
 
 DT = 0.05
@@ -82,7 +84,8 @@ def reference(smoother, key, values, times, measurement, sigma, order):
     """Filtered and smoothed hidden states by filterpy, one episode."""
     size = order + 1
     filter_ = KalmanFilter(dim_x=size, dim_z=len(measurement))
-    filter_.x = smoother.initial_mean_[key][:, None].copy()
+    first = np.append(values[0], np.zeros(size - len(measurement)))
+    filter_.x = (first + smoother.initial_mean_[key])[:, None]
     filter_.P = smoother.initial_covariance_[key].copy()
     filter_.H, filter_.R = measurement, np.diag(np.square(sigma))
     density = smoother.process_noise_[key]
@@ -90,7 +93,9 @@ def reference(smoother, key, values, times, measurement, sigma, order):
     f = [np.eye(size), *(transition(step, order) for step in steps)]
     q = [np.zeros((size, size))]
     q += [Q_continuous_white_noise(size, step, density) for step in steps]
-    means, covariances, _, _ = filter_.batch_filter(list(values[..., None]), Fs=f, Qs=q)
+    # the first measurement is where it begins
+    later = [None, *values[1:, :, None]]
+    means, covariances, _, _ = filter_.batch_filter(later, Fs=f, Qs=q)
     return means[..., 0], filter_.rts_smoother(means, covariances, f, q)[0][..., 0]
 
 
@@ -138,6 +143,28 @@ def test_a_given_model_agrees_with_filterpy():
     means, covariances, _, _ = filter_.batch_filter(list(ds[1].states[..., None]), Fs=f, Qs=q)
     expected = filter_.rts_smoother(means, covariances, f, q)[0][..., 0] @ h.T
     np.testing.assert_allclose(smooth[1].states, expected, atol=1e-9)
+
+
+def test_episodes_of_very_different_lengths_take_little_memory():
+    counts = [51] * 300 + [20_001] + [52] * 20
+    rng = np.random.default_rng(0)
+    ds = TrajectoryDataset.from_arrays([rng.normal(size=(n, 1)) for n in counts])
+    grids = list(_chunks(ds))
+    # not the 6.4 million of one grid
+    assert sum(grid.rows.size for grid in grids) < 1.05 * sum(counts)
+    assert max(grid.rows.size for grid in grids) <= 2**16
+    rows = np.concatenate([grid.rows[grid.known] for grid in grids])
+    np.testing.assert_array_equal(np.sort(rows), np.arange(sum(counts)))
+
+
+def test_chunks_do_not_change_the_bits(tracks, monkeypatch):
+    smoother = KalmanSmoother()
+    whole = smoother.fit_transform(tracks[1])
+    past = smoother.transform(tracks[1])
+    monkeypatch.setattr(_kalman_blocks, "_CELLS", 700)
+    assert len(list(_chunks(tracks[1]))) > 5
+    assert smoother.fit_transform(tracks[1]) == whole
+    assert smoother.transform(tracks[1]) == past
 
 
 def test_episodes_of_any_length_are_smoothed_as_if_alone():
@@ -202,6 +229,36 @@ def test_the_likelier_model_is_chosen():
         assert smoother.models_ == {"x": name}
 
 
+def test_filters_of_several_models_stand_side_by_side():
+    """Different orders, and a pair: each as if alone, in its own column."""
+    (slow, _), (fast, _), (pair, _) = (
+        simulate(n=16, steps=60, order=order, density=10.0, seed=seed)
+        for seed, order in enumerate((2, 1, 1))
+    )
+    rng = np.random.default_rng(4)
+    true = np.stack([pair[..., 1], slow[..., 0], fast[..., 0], pair[..., 0]], axis=2)
+    noise = np.array([0.2, 0.05, 0.1, 0.03])
+    ds = TrajectoryDataset.from_arrays(
+        true + noise * rng.normal(size=true.shape), dt=DT, state_names=["v", "slow", "fast", "x"]
+    )
+    how = {"model": "auto", "velocities": {"x": "v"}, "append_velocities": True}
+    smoother = KalmanSmoother(**how)
+    smooth, past = smoother.fit_transform(ds), smoother.transform(ds)
+    assert smoother.models_ == {"slow": "acceleration", "fast": "velocity", "x": "velocity"}
+    assert smooth.state_names == ("v", "slow", "fast", "x", "d_slow", "d_fast")
+    estimated = [smoother.measurement_noise_[name] for name in ds.state_names]
+    np.testing.assert_allclose(estimated, noise, rtol=0.15)
+    for names in (["slow"], ["fast"], ["x", "v"]):
+        pairs = {"x": "v"} if len(names) > 1 else None
+        alone = KalmanSmoother("auto", velocities=pairs, append_velocities=not pairs)
+        part = ds.select_states(names)
+        smooth_part = alone.fit_transform(part)
+        wanted = smooth_part.state_names
+        assert smooth.select_states(wanted).states == pytest.approx(smooth_part.states, abs=1e-9)
+        now = past.select_states(wanted).states
+        assert now == pytest.approx(alone.transform(part).states, abs=1e-9)
+
+
 def test_given_noise_is_kept(tracks):
     ds = tracks[1]
     both = KalmanSmoother(measurement_noise=0.1, process_noise={"x": 3.0}).fit(ds)
@@ -256,21 +313,85 @@ def test_measured_velocities_help_positions(tracks):
 
 
 def test_first_velocity_is_the_mean_of_training(tracks):
-    """The first position tells of the velocity only what training episodes let it tell."""
-    ds = tracks[1]
+    hidden, ds = tracks
     smoother = KalmanSmoother(append_velocities=True).fit(ds)
     first = smoother.transform(ds).states[ds.offsets[:-1]]
-    mean, covariance = smoother.initial_mean_["x"], smoother.initial_covariance_["x"]
-    assert mean[1] == pytest.approx(3.0, abs=0.5)
-    slope = covariance[1, 0] / covariance[0, 0]
-    np.testing.assert_allclose(first[:, 1], mean[1] + slope * (first[:, 0] - mean[0]), atol=1e-9)
+    np.testing.assert_allclose(first[:, 0], ds.states[ds.offsets[:-1], 0])
+    np.testing.assert_allclose(first[:, 1], smoother.initial_mean_["x"][1])
+    assert first[0, 1] == pytest.approx(3.0, abs=0.5)
+    variance, off = smoother.initial_covariance_["x"], hidden[..., 1] - first[0, 1]
+    assert variance[1, 1] == pytest.approx(np.mean(off**2), rel=0.2)
+    assert variance[0, 0] == pytest.approx(smoother.measurement_noise_["x"] ** 2)
 
 
-def test_few_episodes_leave_the_first_state_open():
+def test_few_episodes_leave_the_first_velocity_open():
     hidden, times = simulate(n=2)
     ds = measure(hidden, times, [0.03])
-    first = KalmanSmoother().fit(ds).transform(ds)[0].states[0]
-    np.testing.assert_allclose(first, ds[0].states[0], atol=1e-4)
+    smoother = KalmanSmoother(append_velocities=True).fit(ds)
+    assert smoother.initial_covariance_["x"][1, 1] > 1e6
+    two = smoother.transform(ds).states[[0, 1]]
+    assert two[1, 1] == pytest.approx((two[1, 0] - two[0, 0]) / DT, rel=1e-3)
+
+
+STARTS = {
+    "velocity": ({}, 0.1),
+    "acceleration": ({"model": "acceleration"}, 0.1),
+    "pair": ({"velocities": {"x": "v"}}, 0.1),
+}
+
+
+@pytest.mark.parametrize("choice", STARTS)
+@pytest.mark.parametrize("moved", [0.0, 10.0], ids=["windows", "elsewhere"])
+def test_an_episode_may_begin_where_none_in_training_did(choice, moved):
+    """Training episodes begin at rest in one place."""
+    parameters, sigma = STARTS[choice]
+    hidden, times = simulate(n=40, order=2, density=10.0)
+    hidden = hidden - hidden[:, :1]
+    hidden[..., 0] -= hidden[:, :1, 1] * times  # as the velocities
+    ds = measure(hidden[..., :2], times, [sigma, sigma])
+    if choice != "pair":
+        ds = ds.select_states(["x"])
+    smoother = KalmanSmoother(**parameters).fit(ds)
+    offset = np.array([moved, 0.0])[: ds.states.shape[1]]
+    true = hidden[..., : len(offset)] + offset
+    seen = TrajectoryDataset.from_arrays(
+        ds.states.reshape(true.shape) + offset, dt=DT, state_names=ds.state_names
+    ).window(20)
+    true = TrajectoryDataset.from_arrays(true, dt=DT).window(20)
+    found = smoother.transform(seen)
+    for step in (0, 1, 2, 5):
+        rows = seen.offsets[:-1] + step
+        raw, now = (rms(x.states[rows] - true.states[rows]) for x in (seen, found))
+        assert (now <= 1.05 * raw).all()
+
+
+def test_forecasts_of_windows_are_no_worse_than_raw():
+    rng = np.random.default_rng(0)
+
+    def cart(n):
+        """At rest at 0, then pushed by known actions."""
+        actions = rng.normal(size=(n, 20, 1)).repeat(5, axis=1)
+        states = np.zeros((n, 101, 2))
+        for t in range(100):
+            states[:, t + 1, 0] = states[:, t, 0] + DT * states[:, t, 1]
+            states[:, t + 1, 1] = states[:, t, 1] + DT * 2 * actions[:, t, 0]
+        noisy = states + 0.02 * rng.normal(size=states.shape)
+        how = {"actions": actions, "dt": DT, "state_names": ["x", "v"]}
+        return tuple(TrajectoryDataset.from_arrays(s, **how) for s in (noisy, states))
+
+    train, (seen, true) = cart(40)[0], (ds.window(25) for ds in cart(20))
+    truth = true.states[true.offsets[:-1] + 1]
+    smoother = KalmanSmoother(velocities={"x": "v"})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", SmoothingWarning)
+        errors = [
+            rms(model.fit(train).predict(seen, horizon=1).mean[:, 0] - truth)
+            for model in (
+                OneStepRegressor(LinearRegression()),
+                make_pipeline(smoother, OneStepRegressor(LinearRegression())),
+            )
+        ]
+    assert (errors[1] <= 1.03 * errors[0]).all()
 
 
 # -- the transformed dataset ------------------------------------------------------------------
@@ -398,6 +519,50 @@ def test_forecasts_of_a_pipeline_do_not_see_the_future(controlled, start):
     )
 
 
+def test_smoothed_states_are_marked(controlled):
+    smoother = KalmanSmoother(velocities={"x": "v"})
+    smooth = smoother.fit_transform(controlled)
+    assert smooth.hindsight
+    assert smoother.transform(smooth).hindsight
+    assert not smoother.transform(controlled).hindsight
+    assert not controlled.hindsight
+
+
+def test_forecasts_from_smoothed_states_warn(controlled):
+    smoother = KalmanSmoother(velocities={"x": "v"})
+    smooth = smoother.fit_transform(controlled)
+    model = OneStepRegressor(LinearRegression()).fit(smooth)
+    for forecast in (model.predict, model.forecast, model.score):
+        with pytest.warns(SmoothingWarning, match="a start has seen what follows"):
+            forecast(smooth)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        model.predict(smoother.transform(controlled))
+        model.predict(controlled)
+
+
+def test_training_relative_to_a_model_does_not_warn(controlled):
+    """The baseline is predicted for training targets."""
+    gains = np.random.default_rng(0).normal(size=(24, 1))
+    smooth = KalmanSmoother(velocities={"x": "v"}).fit_transform(controlled.assign(params=gains))
+    baseline = OneStepRegressor(LinearRegression(), inputs="params")
+    model = TrajectoryRegressor(LinearRegression(), baseline=baseline)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", SmoothingWarning)
+        model.fit(smooth)
+    with pytest.warns(SmoothingWarning, match="a start has seen") as caught:
+        model.predict(smooth)
+    assert len(caught) == 1
+
+
+def test_training_states_may_be_filtered(mixed):
+    smoother = KalmanSmoother(training="filter", append_velocities=True)
+    filtered = smoother.fit_transform(mixed)
+    assert filtered == KalmanSmoother(append_velocities=True).fit(mixed).transform(mixed)
+    assert not filtered.hindsight
+    assert filtered != clone(smoother).set_params(training="smooth").fit_transform(mixed)
+
+
 # -- in scikit-learn --------------------------------------------------------------------------
 
 
@@ -423,12 +588,14 @@ def test_cross_validation_by_horizon(controlled):
 def test_grid_search(controlled):
     search = GridSearchCV(
         make_pipeline(KalmanSmoother(), OneStepRegressor(LinearRegression())),
-        {"kalmansmoother__model": ["velocity", "acceleration"]},
+        {"kalmansmoother__model": ["velocity"], "kalmansmoother__training": ["smooth", "filter"]},
         scoring=horizon_scorer(5),
         cv=3,
         error_score="raise",
     ).fit(controlled)
-    assert np.isfinite(search.cv_results_["mean_test_score"]).all()
+    scores = search.cv_results_["mean_test_score"]
+    assert np.isfinite(scores).all()
+    assert scores[0] != scores[1]
 
 
 def test_clone_parameters_and_pickle(mixed):
@@ -595,6 +762,55 @@ def test_resolution_is_not_taken_for_exactness():
     assert "far below" not in told(ds)
 
 
+def ema(values, alpha):
+    return lfilter([alpha], [1, alpha - 1], values, axis=1)
+
+
+@pytest.mark.parametrize("kind", ["moving average", "own output", "random walk", "driven by noise"])
+def test_states_that_the_model_does_not_fit_are_told(kind):
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=(30, 120, 1))
+    steady = np.cumsum(np.cumsum(0.1 * noise, axis=1), axis=1)
+    noisy = steady + rng.normal(size=noise.shape)
+    if kind == "moving average":
+        states = ema(noisy, 0.3)
+    elif kind == "own output":
+        ds = TrajectoryDataset.from_arrays(noisy)
+        states = KalmanSmoother().fit(ds).transform(ds).states.reshape(noise.shape)
+    elif kind == "random walk":
+        states = np.cumsum(noise, axis=1)
+    else:  # a stable system of which every state is known exactly
+        states = lfilter([1], [1, -0.95], noise, axis=1)
+    ds = TrajectoryDataset.from_arrays(states)
+    assert "the model of motion does not fit: innovations are correlated in s0" in told(ds)
+
+
+def test_given_noise_that_is_too_great_is_told(tracks):
+    assert "correlated in x (0." in told(tracks[1], measurement_noise=1.0, process_noise=0.01)
+
+
+@pytest.mark.parametrize("model", ["velocity", "acceleration", "auto"])
+@pytest.mark.parametrize("n", [2, 30])
+def test_motions_of_the_model_are_not(model, n):
+    hidden, times = simulate(n=n, order=2 if model == "acceleration" else 1)
+    assert told(measure(hidden, times, [0.05]), model=model) == ""
+
+
+def test_wrapped_angles_are_told():
+    rng = np.random.default_rng(0)
+    angle = np.cumsum(0.3 + 0.05 * rng.normal(size=(20, 100, 1)), axis=1)
+    noisy = angle + 0.02 * rng.normal(size=angle.shape)
+    wrapped = TrajectoryDataset.from_arrays((noisy + np.pi) % (2 * np.pi) - np.pi)
+    assert "s0: jumps of about 2 pi" in told(wrapped)
+    assert "Unwrap first" in told(wrapped)
+    assert "2 pi" not in told(TrajectoryDataset.from_arrays(noisy))
+    # others may change by 2 pi, too
+    for width in (1.0, 6.0):
+        wide = TrajectoryDataset.from_arrays(width * rng.normal(size=(20, 100, 1)))
+        assert np.abs(np.diff(wide.states[:, 0])).max() > 5
+        assert "2 pi" not in told(wide)
+
+
 def test_states_that_jump_are_told():
     rng = np.random.default_rng(0)
     level = np.repeat(rng.normal(size=(20, 6)), 25, axis=1)
@@ -613,7 +829,8 @@ def test_flights_through_an_on_board_filter_are_told(data_folder):
 def test_constant_states_stay(tracks):
     ds = tracks[1]
     both = TrajectoryDataset.from_arrays(
-        [np.column_stack([e.states, np.full(len(e.states), 7.0)]) for e in ds], dt=DT
+        [np.column_stack([e.states, np.full(len(e.states), 7.0)]) for e in ds],
+        times=[e.times for e in ds],
     )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -641,6 +858,9 @@ def test_constant_states_stay(tracks):
         ({"process_noise": {"v": 1.0}, "velocities": {"x": "v"}}, "it goes by"),
         ({"measurement_noise": -1.0}, "measurement_noise"),
         ({"model": "jerk"}, "model"),
+        ({"training": "both"}, "training"),
+        ({"model": "auto", "process_noise": 1.0}, "other units for each model"),
+        ({"model": "auto", "process_noise": {"x": 1.0}}, "other units for each model"),
     ],
 )
 def test_bad_parameters(mixed, parameters, message):

@@ -73,6 +73,43 @@ def test_equality_sees_it(ds):
     assert ds == ds[:]
 
 
+HINDSIGHT = {
+    "index": lambda ds: ds[[2, 0]],
+    "truncate": lambda ds: ds.truncate(3),
+    "window": lambda ds: ds.window(2, stride=1),
+    "decimate": lambda ds: ds.decimate(2),
+    "resample": lambda ds: ds.resample(0.3),
+    "select": lambda ds: ds.select_states(["v"]),
+    "noise": lambda ds: ds.add_noise(0.1),
+    "assign": lambda ds: ds.assign(params=[5.0]),
+    "pickle": lambda ds: pickle.loads(pickle.dumps(ds)),
+}
+
+
+@pytest.mark.parametrize("edit", HINDSIGHT)
+def test_hindsight_stays(ds, edit):
+    marked = TrajectoryDataset._of(replace(ds._columns, hindsight=True), ds._names)
+    assert HINDSIGHT[edit](marked).hindsight
+    assert not HINDSIGHT[edit](ds).hindsight
+
+
+def test_hindsight_of_one_is_that_of_all(ds):
+    marked = TrajectoryDataset._of(replace(ds._columns, hindsight=True), ds._names)
+    assert ds.concatenate(marked).hindsight
+    assert marked.concatenate(ds).hindsight
+    assert not ds.concatenate(ds).hindsight
+    assert marked != ds
+    assert "hindsight" in repr(marked)
+    assert "hindsight" not in repr(ds)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".parquet"])
+def test_files_keep_hindsight(ds, tmp_path, suffix):
+    marked = TrajectoryDataset._of(replace(ds._columns, hindsight=True), ds._names)
+    marked.save(tmp_path / f"log{suffix}")
+    assert TrajectoryDataset.load(tmp_path / f"log{suffix}") == marked
+
+
 def test_datasets_with_and_without_it_do_not_join(ds):
     plain = TrajectoryDataset.from_arrays(
         [np.zeros((3, 2))], state_names=["x", "v"], params=[[1.0]]

@@ -12,7 +12,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from trajlearn.dynamics._query import Query, make_query
 from trajlearn.dynamics.forecast import Forecast
-from trajlearn.exceptions import DivergenceWarning, HorizonWarning
+from trajlearn.exceptions import DivergenceWarning, HorizonWarning, SmoothingWarning
 from trajlearn.trajectories import TrajectoryDataset, as_dataset
 from trajlearn.trajectories._relabeler import generator
 from trajlearn.trajectories.rewards import Reward, step_rewards
@@ -123,6 +123,8 @@ class Forecaster(BaseEstimator):
 
         Warns
         -----
+        SmoothingWarning
+            If a smoother has estimated the states from what follows them, too (`hindsight`).
         HorizonWarning
             If a horizon is longer than any in training.
         DivergenceWarning
@@ -139,6 +141,7 @@ class Forecaster(BaseEstimator):
             within_log=self._ends_with_log(ds, actions, policy),
             within_stretch=self._needs_constant_params,
         )
+        self._warn_hindsight(ds)
         self._warn_beyond_training(query)
         rng = np.random.default_rng() if random_state is None else generator(random_state)
         prediction = self._forecast(
@@ -236,6 +239,15 @@ class Forecaster(BaseEstimator):
                 f"model was fitted on {d_s} ({', '.join(self.state_names_)})."
             )
         return ds
+
+    def _warn_hindsight(self, ds: TrajectoryDataset) -> None:
+        if ds.hindsight:
+            warnings.warn(
+                "states estimated from whole episodes, so that a start has seen what follows; use "
+                "the smoother in a Pipeline, or transform().",
+                SmoothingWarning,
+                stacklevel=4,
+            )
 
     def _warn_beyond_training(self, query: Query) -> None:
         longest = np.nanmax(query.horizons)

@@ -177,6 +177,9 @@ def _finite(model: Any, states: Floats) -> Floats:
 def _forecast_of(model: Any, ds: TrajectoryDataset, **settings: Any) -> Forecast:
     """Forecast from the first states by a baseline, which has to be one of these states."""
     name = type(model).__name__
+    if ds.hindsight:
+        # for training targets it is what is wanted; a forecast has warned already
+        ds = TrajectoryDataset._of(Columns(**(vars(ds._columns) | {"hindsight": False})), ds._names)
     forecast = model.predict(ds, **settings)
     if not isinstance(forecast, Forecast):
         raise TypeError(

@@ -27,7 +27,8 @@ class Columns:
     """All fields of all episodes; absent ones are None.
 
     ``params`` has one row an episode, or one a step where `params_per_step` is true. ``observed``
-    are the states as logged, where a transformer replaced them by estimates.
+    are the states as logged, where a transformer replaced them by estimates, and `hindsight` tells
+    that these estimates have seen what follows them.
     """
 
     offsets: NDArray[np.intp]
@@ -44,6 +45,7 @@ class Columns:
     group: NDArray[Any] | None = None
     context: dict[str, NDArray[Any]] = field(default_factory=dict)
     params_per_step: bool = False
+    hindsight: bool = False
 
     @property
     def n_episodes(self) -> int:

@@ -64,6 +64,15 @@ class Fields:
         return self._columns.observed
 
     @property
+    def hindsight(self) -> bool:
+        """Whether `states` were estimated from whole episodes, each also from what follows it.
+
+        Such states (of a smoother) are for training: a forecast from them is no fair test, and
+        warns.
+        """
+        return self._columns.hindsight
+
+    @property
     def has_params(self) -> bool:
         """Whether the episodes carry controller parameters (p > 0)."""
         return self._columns.params is not None

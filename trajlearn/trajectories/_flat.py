@@ -35,6 +35,7 @@ def assemble(
     params_per_step: bool = False,
     references: ArrayLike | None = None,
     observed: ArrayLike | None = None,
+    hindsight: bool = False,
     group: Sequence[Any] | None = None,
     context: Mapping[str, Sequence[Any]] | None = None,
 ) -> TrajectoryDataset:
@@ -50,6 +51,7 @@ def assemble(
     actions, rewards : array-like with one row a step
     params : array-like with one row a step if `params_per_step`, else one an episode
     terminated, time_origin, group, context : one value an episode
+    hindsight : bool
 
     Raises
     ------
@@ -95,6 +97,7 @@ def assemble(
             for key, values in (context or {}).items()
         },
         params_per_step=params_per_step,
+        hindsight=hindsight,
         **floats,
     )
     if any(len(values) != n for values in (columns.ids, *columns.context.values())):

@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 
 from trajlearn.exceptions import MixedSamplingError
 from trajlearn.trajectories._columns import runs
-from trajlearn.trajectories._kalman_fit import Noise, Signals, fit_noise, fit_start
+from trajlearn.trajectories._kalman_fit import (
+    Noise,
+    Signals,
+    Start,
+    correlations,
+    fit_noise,
+    fit_start,
+)
 from trajlearn.trajectories._kalman_models import Motion, StateSpaceModel
 from trajlearn.trajectories._state_space import Bank, Grid, combine
 from trajlearn.trajectories.dataset import TrajectoryDataset
@@ -22,8 +29,9 @@ Floats = NDArray[np.float64]
 _N_STRETCHES, _LENGTH = 128, 128
 # First states are learnt from at most so many episodes, each smoothed over so many states.
 _N_STARTS, _START_LENGTH = 512, 128
-# Episodes filtered side by side; what memory a dataset takes is bounded by it.
-_CHUNK = 256
+# Cells (episodes times the longest of them) that are filtered side by side; what memory a dataset
+# takes beyond its longest episode is bounded by it.
+_CELLS = 2**16
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -49,10 +57,11 @@ class FittedBlock(Block):
     """A filter with its noise and the distribution of the first hidden state."""
 
     noise: Noise
-    mean: Floats
-    covariance: Floats
+    start: Start
     moved: Floats
     """How far smoothing moves the states that it measures (d,), root mean square."""
+    correlated: tuple[Floats, Floats, int]
+    """`correlations` of its innovations."""
     dt: float
 
     @property
@@ -85,19 +94,24 @@ def fit_block(
     chosen = _spread(np.arange(len(ds)), _N_STARTS)
     counts = np.minimum(ds.lengths[chosen] + 1, _START_LENGTH)
     starts = Grid.of(ds.offsets[:-1][chosen], counts, ds.times)
-    mean, covariance, gap = fit_start(Signals(values, starts, motion), noise)
+    everywhere = Signals(values, grid, motion)
+    start, gap = fit_start(Signals(values, starts, motion), everywhere, noise)
     if isinstance(motion, StateSpaceModel):
         if motion.R is not None:
             gap = combine(gap, np.asarray(np.linalg.inv(motion.scale), dtype=np.float64))
         if motion.initial_mean is not None:
-            mean = np.asarray(motion.initial_mean, dtype=np.float64)
-            covariance = np.asarray(motion.initial_covariance, dtype=np.float64)
+            start = Start(
+                gain=np.zeros_like(start.gain),
+                mean=np.asarray(motion.initial_mean, dtype=np.float64),
+                covariance=np.asarray(motion.initial_covariance, dtype=np.float64),
+                told=False,
+            )
     return FittedBlock(
         **vars(block),
         noise=noise,
-        mean=mean,
-        covariance=covariance,
+        start=start,
         moved=np.sqrt(np.mean(gap**2, axis=0)),
+        correlated=correlations(everywhere, noise),
         dt=float(np.median(grid.dt)),
     )
 
@@ -108,6 +122,7 @@ def estimate(
     run: Callable[[Bank, Floats, NDArray[np.bool_]], Floats],
 ) -> list[Floats]:
     """Outputs of each block (rows, k), by a pass `run` over all episodes."""
+    values = [block.measured(ds.states) for block in blocks]
     found = [np.empty((len(ds.states), len(block.outputs))) for block in blocks]
     for grid in _chunks(ds):
         rows = grid.rows[grid.known]
@@ -115,35 +130,39 @@ def estimate(
         for motion, items in groupby(blocks, key=lambda block: block.motion):
             group = list(items)
             _check_sampling(group[0], grid, ds)
-            hidden = run(
-                _bank(motion, group, grid),
-                np.stack([block.measured(ds.states)[grid.rows] for block in group], axis=1),
-                grid.known,
-            )
+            of = values[position : position + len(group)]
+            measured = np.stack([some[grid.rows] for some in of], axis=1)
+            hidden = run(_bank(motion, group, grid, measured[0]), measured, grid.known)
             for b, block in enumerate(group):
-                values = combine(hidden[:, b], block.outputs)
-                found[position + b][rows] = values[grid.known]
+                found[position + b][rows] = combine(hidden[:, b], block.outputs)[grid.known]
             position += len(group)
     return found
 
 
-def _bank(motion: Motion, blocks: Sequence[FittedBlock], grid: Grid) -> Bank:
+def _bank(motion: Motion, blocks: Sequence[FittedBlock], grid: Grid, first: Floats) -> Bank:
+    """The filters, for episodes whose first measured numbers are `first` (B, n, d)."""
     f, q = motion.matrices(grid.dt)
+    starts = [block.start for block in blocks]
     return Bank(
         transition=f,
         process=q,
         measurement=motion.measurement,
         intensity=np.array([block.noise.intensity for block in blocks]),
         variance=np.stack([block.noise.variance for block in blocks]),
-        mean=np.stack([block.mean for block in blocks]),
-        covariance=np.stack([block.covariance for block in blocks]),
+        mean=np.stack([combine(y, s.gain) + s.mean for y, s in zip(first, starts, strict=True)]),
+        covariance=np.stack([start.covariance for start in starts]),
+        told=starts[0].told,
     )
 
 
 def _chunks(ds: TrajectoryDataset) -> Iterator[Grid]:
+    """Episodes of like lengths, so many that they fill at most `_CELLS`."""
     order = np.argsort(ds.lengths, kind="stable")
-    for i in range(0, len(order), _CHUNK):
-        chosen = order[i : i + _CHUNK]
+    counts = ds.lengths[order] + 1
+    while len(order):
+        cells = counts * np.arange(1, len(order) + 1)
+        n = max(1, int(np.searchsorted(cells, _CELLS, side="right")))
+        chosen, order, counts = order[:n], order[n:], counts[n:]
         yield Grid.of(ds.offsets[:-1][chosen], ds.lengths[chosen] + 1, ds.times)
 
 

@@ -1,4 +1,4 @@
-"""Where smoothing cannot help: states that were filtered already, velocities that contradict."""
+"""Where smoothing cannot help: filtered states, motion unlike the model, wrapped angles."""
 
 import warnings
 from collections.abc import Sequence
@@ -9,7 +9,14 @@ from numpy.typing import NDArray
 from trajlearn.exceptions import SmoothingWarning
 from trajlearn.trajectories._kalman_fit import Signals
 
-__all__ = ["contradiction", "warn_contradicting", "warn_filtered", "warn_misfit"]
+__all__ = [
+    "contradiction",
+    "warn_contradicting",
+    "warn_correlated",
+    "warn_filtered",
+    "warn_misfit",
+    "warn_wrapped",
+]
 
 Floats = NDArray[np.float64]
 
@@ -17,6 +24,11 @@ Floats = NDArray[np.float64]
 _FILTERED = 0.05
 # A smoother that moves states by more than so much of their noise removes motion, not noise.
 _MISFIT = 1.2
+# Correlation of innovations that is of material size: over one sample, and summed over the next
+# three where it is negative. And how many standard errors it has to be at least.
+_NEXT, _LATER, _ERRORS = 0.3, -0.25, 4.0
+# By how much noise may widen the values of a wrapped angle.
+_WIDER = 1.0
 # Steps over which a change of position is compared with the integral of the velocity.
 _STEPS = 20
 # Share of the change of position that may be missing in that integral for reasons of sampling.
@@ -53,7 +65,7 @@ def warn_filtered(names: Sequence[str], noise: Floats, change: Floats) -> list[s
     return list(low)
 
 
-def warn_misfit(names: Sequence[str], moved: Floats, noise: Floats) -> None:
+def warn_misfit(names: Sequence[str], moved: Floats, noise: Floats) -> list[str]:
     """Warn of states that smoothing moves further than their noise.
 
     Parameters
@@ -61,20 +73,81 @@ def warn_misfit(names: Sequence[str], moved: Floats, noise: Floats) -> None:
     names : sequence of d names
     moved, noise : ndarray of shape (d,)
         Root mean square, and standard deviation.
+
+    Returns
+    -------
+    list of str
+        Their names.
     """
-    off = [
-        f"{name} by {far:.2g} (noise {sigma:.2g})"
+    off = {
+        name: f"{name} by {far:.2g} (noise {sigma:.2g})"
         for name, far, sigma in zip(names, moved, noise, strict=True)
         if far > _MISFIT * sigma
-    ]
+    }
     if off:
         warnings.warn(
-            f"smoothing moves {', '.join(off)}: more than noise explains, so the model of motion "
-            "does not fit (jumps, fast transients, too slow sampling). Leave these states out "
-            "(states=), try another model, or give process_noise.",
+            f"smoothing moves {', '.join(off.values())}: more than noise explains, so the model "
+            "of motion does not fit (jumps, fast transients, too slow sampling). Leave these "
+            "states out (states=), try another model, or give process_noise.",
             SmoothingWarning,
             stacklevel=5,
         )
+    return list(off)
+
+
+def warn_correlated(found: dict[str, tuple[float, float, int]]) -> None:
+    """Warn of states whose innovations are correlated: the model of motion is another one.
+
+    Parameters
+    ----------
+    found : mapping from name to numbers
+        As of `correlations`: over one sample, over the next three, from how many.
+    """
+    off = []
+    for name, (following, later, n) in found.items():
+        error = _ERRORS / np.sqrt(max(n, 1))
+        if abs(following) > max(_NEXT, error) or later < min(_LATER, -error * np.sqrt(3)):
+            off.append(
+                f"{name} ({following:.2f} over one sample, {later:.2f} in all over two to four)"
+            )
+    if off:
+        warnings.warn(
+            f"the model of motion does not fit: innovations are correlated in {', '.join(off)}. "
+            "What it takes for noise is motion, or was filtered already, and smoothing may harm: "
+            "compare with and without, or leave these states out (states=).",
+            SmoothingWarning,
+            stacklevel=5,
+        )
+
+
+def warn_wrapped(names: Sequence[str], states: Floats, steps: Floats) -> list[str]:
+    """Warn of states that look like angles which jump by 2 pi.
+
+    Parameters
+    ----------
+    names : sequence of d names
+    states, steps : ndarray of shape (rows, d) and (some, d)
+        Values, and changes from sample to sample.
+
+    Returns
+    -------
+    list of str
+        Their names.
+    """
+    size = np.abs(steps)
+    jumps = (size > 1.5 * np.pi).sum(axis=0)
+    # of motion or noise that is so wide, most changes are less than its whole width
+    between = (size > 0.5 * np.pi).sum(axis=0) - jumps
+    wraps = (jumps > between) & (np.ptp(states, axis=0) < 2 * np.pi + _WIDER)
+    off = [name for name, is_angle in zip(names, wraps, strict=True) if is_angle]
+    if off:
+        warnings.warn(
+            f"{', '.join(off)}: jumps of about 2 pi between samples, as of an angle that wraps. "
+            "Unwrap first (numpy.unwrap), or leave out (states=).",
+            SmoothingWarning,
+            stacklevel=5,
+        )
+    return off
 
 
 def contradiction(signals: Signals) -> float | None:

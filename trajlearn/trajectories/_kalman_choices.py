@@ -10,7 +10,14 @@ import numpy as np
 from trajlearn.trajectories._kalman_blocks import Block
 from trajlearn.trajectories._kalman_models import Kinematic, StateSpaceModel
 
-__all__ = ["MODELS", "given_noise", "kinematic_blocks", "known_states", "state_space_block"]
+__all__ = [
+    "MODELS",
+    "check_process_noise",
+    "given_noise",
+    "kinematic_blocks",
+    "known_states",
+    "state_space_block",
+]
 
 MODELS = {"velocity": (1,), "acceleration": (2,), "auto": (1, 2)}
 
@@ -104,6 +111,21 @@ def state_space_block(
         outputs=np.array(rows, dtype=np.float64),
         appended=tuple(model.outputs),
     )
+
+
+def check_process_noise(model: Any, process_noise: Any) -> None:
+    """Refuse one number for models in different units.
+
+    Raises
+    ------
+    ValueError
+    """
+    if isinstance(model, str) and model == "auto" and process_noise is not None:
+        raise ValueError(
+            "process_noise has other units for each model (unit^2 / time^3 for a velocity that "
+            'drifts, unit^2 / time^5 for an acceleration), so it does not go with model="auto": '
+            'choose "velocity" or "acceleration", or leave it out.'
+        )
 
 
 def given_noise(value: Any, parameter: str, names: Sequence[str]) -> dict[str, float]:

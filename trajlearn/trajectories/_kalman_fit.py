@@ -1,4 +1,4 @@
-"""Noise of a filter by maximum likelihood, and the distribution of the first hidden states."""
+"""Noise of a filter by maximum likelihood, where episodes begin, and whether the model fits."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,9 +9,16 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from trajlearn.trajectories._kalman_models import Motion
-from trajlearn.trajectories._state_space import Bank, Grid, combine, innovations, smoothed
+from trajlearn.trajectories._state_space import (
+    Bank,
+    Grid,
+    combine,
+    innovations,
+    smoothed,
+    standardised,
+)
 
-__all__ = ["Noise", "Signals", "fit_noise", "fit_start"]
+__all__ = ["Noise", "Signals", "Start", "correlations", "fit_noise", "fit_start"]
 
 Floats = NDArray[np.float64]
 
@@ -29,6 +36,8 @@ _EXACT = 1e-9
 _ORDER, _CLIP, _INSIDE = 4, 2.0, 0.7737
 # Standard deviation that the likelihood may choose, in what they show: that is an estimate, too.
 _SLACK = 1.05
+# Innovations beyond so many standard deviations count as such.
+_CLIP_WHITE = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,6 +47,17 @@ class Noise:
     variance: Floats
     intensity: float
     deviance: float = np.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """First hidden state: ``gain @ y + mean``, where y (d,) are its measured numbers."""
+
+    gain: Floats
+    mean: Floats
+    covariance: Floats
+    told: bool = True
+    """Whether that takes account of y; else a filter has yet to."""
 
 
 class Signals:
@@ -213,27 +233,77 @@ def _descend(
     return np.asarray(minimize(with_slope, start, jac=True, bounds=limits, **how).x)
 
 
-def fit_start(signals: Signals, noise: Noise) -> tuple[Floats, Floats, Floats]:
-    """First hidden states of new stretches, and how far smoothing moves the measured numbers.
+def fit_start(first: Signals, everywhere: Signals, noise: Noise) -> tuple[Start, Floats]:
+    """Where new episodes begin, and how far smoothing moves the measured numbers.
 
-    The covariance is that of the smoothed first states of these stretches, widened as the
-    predictive (Student t) distribution of one more asks for. Where they are fewer than m + 4,
-    only the mean is used and the covariance is vague.
+    An episode may begin where none in training did, such as a window or one with another
+    set-point. So nothing is assumed of what is measured: the first measurement is the estimate.
+    The rest of the hidden state has the mean that it has at the start of training episodes, and
+    deviates from it by as much as all states in training do. That covariance is widened as the
+    predictive (Student t) distribution of another episode asks for; of too few it is vague.
+
+    Parameters
+    ----------
+    first : Signals
+        Episodes from their beginning on.
+    everywhere : Signals
+        Stretches from any part of them.
+    noise : Noise
 
     Returns
     -------
-    mean : ndarray of shape (m,)
-    covariance : ndarray of shape (m, m)
+    start : Start
     gap : ndarray of shape (rows, d)
-        What smoothing takes off the measured numbers.
+        What smoothing takes off the measured numbers of `everywhere`.
+    """
+    h = everywhere.motion.measurement
+    d, m = h.shape
+    root, rank = np.sqrt(everywhere.hidden), int(np.linalg.matrix_rank(h))
+    # several sensors of one thing count by their variances
+    weight = 1 / np.sqrt(everywhere.unit if rank == d else noise.variance)
+    gain = root[:, None] * np.linalg.pinv(weight[:, None] * h * root) * weight
+    rest = np.eye(m) - gain @ h
+    bank = everywhere.bank(noise.variance[None], np.array([noise.intensity]))
+    hidden = smoothed(bank, everywhere.measured, everywhere.grid.known)
+    gap = (everywhere.measured - combine(hidden, h))[:, 0][everywhere.grid.known]
+    begin = smoothed(
+        first.bank(noise.variance[None], np.array([noise.intensity])),
+        first.measured,
+        first.grid.known,
+    )[0, 0]
+    n, free = len(begin), m - rank
+    mean = begin.mean(axis=0)
+    spread = bank.covariance[0]
+    if n >= free + 4:
+        off = hidden[:, 0][everywhere.grid.known] - mean
+        widen = (n - 1) * (n + 1) / (n * (n - free - 2))
+        spread = widen * (off.T @ off) / len(off) + _EXACT**2 * np.diag(everywhere.hidden)
+    covariance = (gain * noise.variance) @ gain.T + rest @ spread @ rest.T
+    return Start(gain, rest @ mean, (covariance + covariance.T) / 2), gap
+
+
+def correlations(signals: Signals, noise: Noise) -> tuple[Floats, Floats, int]:
+    """Autocorrelations of the innovations, which a model that fits leaves white.
+
+    Returns
+    -------
+    next : ndarray of shape (d,)
+        Over one sample.
+    later : ndarray of shape (d,)
+        Sum of those over 2, 3 and 4 samples. After a jump that stays, a filter runs past it and
+        comes back: they are negative.
+    n : int
+        Innovations that they are from.
     """
     bank = signals.bank(noise.variance[None], np.array([noise.intensity]))
-    hidden = smoothed(bank, signals.measured, signals.grid.known)
-    gap = (signals.measured - combine(hidden, bank.measurement))[:, 0][signals.grid.known]
-    starts = hidden[0, 0]
-    n, m = starts.shape
-    mean = starts.mean(axis=0)
-    if n < m + 4:
-        return mean, bank.covariance[0], gap
-    spread = np.atleast_2d(np.cov(starts.T)) * (n - 1) * (n + 1) / (n * (n - m - 2))
-    return mean, spread + _EXACT**2 * np.diag(signals.hidden), gap
+    values = standardised(bank, signals.measured)[:, 0]
+    d, m = signals.motion.measurement.shape
+    known = signals.grid.known.copy()
+    known[: -(-m // d)] = False
+    # a few violent moments are not to decide alone
+    values = np.where(known[..., None], np.clip(values, -_CLIP_WHITE, _CLIP_WHITE), 0.0)
+    total = np.maximum((values**2).sum(axis=(0, 1)), np.finfo(np.float64).tiny)
+    by_lag = np.zeros((5, d))
+    for lag in range(1, min(5, len(values))):
+        by_lag[lag] = (values[lag:] * values[:-lag]).sum(axis=(0, 1)) / total
+    return by_lag[1], by_lag[2:].sum(axis=0), int(known.sum())

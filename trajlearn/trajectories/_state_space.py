@@ -8,12 +8,11 @@ library: an estimate has the same bits whatever stands beside it or after it in 
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bank", "Grid", "combine", "filtered", "innovations", "smoothed"]
+__all__ = ["Bank", "Grid", "combine", "filtered", "innovations", "smoothed", "standardised"]
 
 Floats = NDArray[np.float64]
 
@@ -58,6 +57,8 @@ class Bank:
     """Of the first hidden state (B, m) or (B, n, m)."""
     covariance: Floats
     """Of the first hidden state (B, m, m)."""
+    told: bool = False
+    """Whether mean and covariance take account of the first measurement already."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +100,16 @@ def innovations(bank: Bank, measured: Floats, counted: NDArray[np.bool_]) -> tup
             log_variance += np.log(variance).sum(axis=1)
             squares += (error * error / variance).sum(axis=1)
     return log_variance, squares
+
+
+def standardised(bank: Bank, measured: Floats) -> Floats:
+    """Innovations over their standard deviations (L, B, n, d)."""
+    return np.stack(
+        [
+            np.stack([error / np.sqrt(variance) for error, variance, _ in step.innovations], -1)
+            for step in _forward(bank, measured)
+        ]
+    )
 
 
 def smoothed(bank: Bank, measured: Floats, known: NDArray[np.bool_]) -> Floats:
@@ -148,7 +159,7 @@ def _forward(bank: Bank, measured: Floats) -> Iterator[_Step]:
             covariance = covariance + bank.intensity[:, None, None, None] * bank.process[t - 1]
         found = []
         # numbers with independent errors may come in one after the other: no inverse
-        for i, row in enumerate(bank.measurement):
+        for i, row in enumerate(bank.measurement if t or not bank.told else ()):
             spread = _dot(covariance, row)
             variance = _dot(spread, row) + bank.variance[:, None, i]
             gain = spread / variance[..., None]
@@ -166,7 +177,7 @@ def _forward(bank: Bank, measured: Floats) -> Iterator[_Step]:
 
 def _dot(values: Floats, row: Floats) -> Floats:
     """``values @ row`` over the last axis."""
-    total: Any = 0.0
+    total = np.zeros(values.shape[:-1])
     for j in np.flatnonzero(row):
         total = total + values[..., j] * row[j]
     return total

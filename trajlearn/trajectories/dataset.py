@@ -326,6 +326,8 @@ class TrajectoryDataset(Fields):
                 parts.append(f"{label}={len(self._names[field])}")
         if self.observed is not None:
             parts.append("observed")
+        if self.hindsight:
+            parts.append("hindsight")
         if self.params_vary:
             parts.append("params vary")
         if self.terminated.any():

@@ -215,7 +215,10 @@ def concatenate(ds: TrajectoryDataset, *others: TrajectoryDataset) -> Trajectory
                 )
     parts = [item._columns for item in (ds, *others)]
     per_step = any(part.params_per_step for part in parts)
-    joined: dict[str, Any] = {"params_per_step": per_step}
+    joined: dict[str, Any] = {
+        "params_per_step": per_step,
+        "hindsight": any(part.hindsight for part in parts),
+    }
     for name in (
         "states",
         "times",
@@ -314,7 +317,7 @@ def assign(ds: TrajectoryDataset, **fields: Any) -> TrajectoryDataset:
     )
     if ds.observed is None:
         return changed
-    columns = replace(changed._columns, observed=ds.observed)
+    columns = replace(changed._columns, observed=ds.observed, hindsight=ds.hindsight)
     return TrajectoryDataset._of(columns, changed._names | {"observed": ds.observed_names})
 
 

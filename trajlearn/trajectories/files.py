@@ -146,6 +146,7 @@ def _write_npz(ds: TrajectoryDataset, handle: IO[bytes]) -> None:
         "names": {field: list(names) for field, names in ds._names.items()},
         "context": list(columns.context),
         "params_per_step": columns.params_per_step,
+        "hindsight": columns.hindsight,
     }
     arrays = {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
     arrays["counts"] = np.diff(columns.offsets)
@@ -169,6 +170,7 @@ def _read_npz(handle: IO[bytes]) -> TrajectoryDataset:
     return assemble(
         names=header["names"],
         params_per_step=header["params_per_step"],
+        hindsight=header.get("hindsight", False),
         context=context,
         ids=arrays.pop("ids").tolist(),
         group=None if group is None else group.tolist(),
@@ -200,6 +202,7 @@ def _write_parquet(ds: TrajectoryDataset, handle: IO[bytes]) -> None:
         "columns": labels,
         "crc32": _checksum(ds),
         "params_per_step": ds.params_vary,
+        "hindsight": ds.hindsight,
     }
     frame = build_table(ds, labels, ds.ids)
     position = np.arange(len(frame)) - np.repeat(ds.offsets[:-1], ds.lengths + 1)
@@ -254,6 +257,8 @@ def _read_parquet(handle: IO[bytes]) -> TrajectoryDataset:
         rewards=None if rewards is None else rewards[:, 0],
         params=stacked("params", is_step if per_step else starts),
         params_per_step=per_step,
+        # files of earlier versions have no such entry
+        hindsight=header.get("hindsight", False),
         references=stacked("references", every),
         observed=stacked("observed", every),
         group=by_episode("group", None),
@@ -273,6 +278,8 @@ def _checksum(ds: TrajectoryDataset) -> int:
     """Of everything in the dataset: Parquet guards its pages, but not its footer."""
     labels = [ds._names, ds.ids.tolist(), ds.group if ds.group is None else ds.group.tolist()]
     labels += [(key, values.tolist()) for key, values in ds.context.items()]
+    if ds.hindsight:
+        labels.append("hindsight")
     total = zlib.crc32(repr(labels).encode())
     columns = ds._columns
     for values in (

@@ -21,11 +21,14 @@ from trajlearn.trajectories._kalman_blocks import (
 from trajlearn.trajectories._kalman_checks import (
     contradiction,
     warn_contradicting,
+    warn_correlated,
     warn_filtered,
     warn_misfit,
+    warn_wrapped,
 )
 from trajlearn.trajectories._kalman_choices import (
     MODELS,
+    check_process_noise,
     given_noise,
     kinematic_blocks,
     known_states,
@@ -52,19 +55,24 @@ class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None
     a dynamics estimator in a `Pipeline` that is what fitting and predicting call. The raw states
     stay in `observed`, and scores compare with those.
 
+    What `fit_transform` returns has seen the future (`TrajectoryDataset.hindsight`; forecasts
+    from it warn): train on it, but never smooth before splitting into training and test, and
+    test on raw episodes through the `Pipeline` or on `transform` of them.
+
     Each state has a filter of its own, whose velocity (or acceleration) drifts by white noise;
     `velocities` names states that are measured velocities of others, and a `StateSpaceModel`
     treats several states together. Times may be irregular. Values are plain numbers: unwrap
     angles first.
 
     The variance of the noise and the spectral density of the drift maximise the exact likelihood
-    of the innovations over (up to 128 stretches of 128 states of) the training episodes. The
-    first state of an episode has the mean and covariance of the smoothed first states in
-    training: a velocity that was not measured is estimated as that mean at the first state, and
-    from two states on better and better.
+    of the innovations over (up to 128 stretches of 128 states of) the training episodes. An episode
+    may begin anywhere: the first measurement is the first estimate. A velocity that was not
+    measured begins with the mean that it has at the start of training episodes, and the
+    covariance of all states in training about it; from two states on it is better and better.
 
-    A model of motion knows nothing of actions: where states jump, or change much from one sample
-    to the next, it takes signal for noise. Compare with and without by cross-validation.
+    A model of motion knows nothing of actions: where states jump, change much from one sample to
+    the next, or are known exactly but driven by noise, it takes motion for noise. `fit` warns
+    where it sees that, not everywhere: compare with and without by cross-validation.
 
     Parameters
     ----------
@@ -84,7 +92,10 @@ class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None
     process_noise : float, mapping or None, default=None
         Spectral density of the white noise that drives the velocity (unit^2 / time^3) or the
         acceleration (unit^2 / time^5); a factor of Q for a `StateSpaceModel` without R. By the
-        name of the (position) state. What is not given is estimated.
+        name of the (position) state, and not with "auto". What is not given is estimated.
+    training : {"smooth", "filter"}, default="smooth"
+        What `fit_transform` returns: smoothed states, or filtered ones as `transform` does, such
+        that training and test states have the same kind of error and nothing has seen the future.
 
     Attributes
     ----------
@@ -97,13 +108,17 @@ class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None
     models_ : dict from str to str
         "velocity" or "acceleration" by (position) state; empty for a `StateSpaceModel`.
     initial_mean_, initial_covariance_ : dict from str to ndarray
-        Of the first hidden state (position, velocity, ...), by the keys of `process_noise_`.
+        Of the first hidden state (position, velocity, ...), by the keys of `process_noise_`. The
+        mean is 0 in what is measured, to which the first measurement is added; the covariance
+        holds given that. Those of a `StateSpaceModel` that has them: as given.
 
     Warns
     -----
     SmoothingWarning
         In `fit`: if the noise of a state is far below its change between samples (noise-free, or
-        filtered already), or a velocity is not the derivative of its position.
+        filtered already); if smoothing moves it by more than its noise, or its innovations are
+        correlated (states that jump or are driven by noise of their own, outputs of a filter);
+        if it jumps by 2 pi; or if a velocity is not the derivative of its position.
 
     See Also
     --------
@@ -139,6 +154,7 @@ class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None
         "append_velocities": ["boolean", "array-like"],
         "measurement_noise": [Interval(Real, 0, None, closed="neither"), Mapping, None],
         "process_noise": [Interval(Real, 0, None, closed="neither"), Mapping, None],
+        "training": [StrOptions({"smooth", "filter"})],
     }
 
     def __init__(
@@ -150,6 +166,7 @@ class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None
         append_velocities: bool | Sequence[str] = False,
         measurement_noise: float | Mapping[str, float] | None = None,
         process_noise: float | Mapping[str, float] | None = None,
+        training: str = "smooth",
     ) -> None:
         self.model = model
         self.states = states
@@ -157,6 +174,7 @@ class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None
         self.append_velocities = append_velocities
         self.measurement_noise = measurement_noise
         self.process_noise = process_noise
+        self.training = training
 
     # -- fitting --------------------------------------------------------------------------
 
@@ -176,10 +194,11 @@ class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None
         Raises
         ------
         ValueError
-            If a name is unknown or used twice, a given noise is not positive, or the episodes
-            are too short to estimate noise from.
+            If a name is unknown or used twice, a given noise is not positive or goes with
+            ``model="auto"``, or the episodes are too short to estimate noise from.
         """
         ds = as_dataset(X)
+        check_process_noise(self.model, self.process_noise)
         self.state_names_ = ds.state_names
         names = known_states(self.states, "states", ds.state_names)
         choices = self._choices(names)
@@ -211,7 +230,7 @@ class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None
         return self
 
     def fit_transform(self, X: Any, y: None = None) -> TrajectoryDataset:
-        """Fit, and smooth the same episodes: each state estimated from the whole episode.
+        """Fit, and estimate the states of the same episodes, as `training` says.
 
         Parameters
         ----------
@@ -221,8 +240,14 @@ class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None
         Returns
         -------
         TrajectoryDataset
+            With ``training="smooth"`` each state is estimated from the whole episode, and the
+            dataset is marked so (`hindsight`).
         """
-        return self.fit(X)._estimated(as_dataset(X), smoothed)
+        self.fit(X)
+        if self.training == "filter":
+            return self.transform(X)
+        ds = self._estimated(as_dataset(X), smoothed)
+        return TrajectoryDataset._of(replace(ds._columns, hindsight=True), ds._names)
 
     def transform(self, X: Any) -> TrajectoryDataset:
         """Filter: each state estimated from the measurements up to it.
@@ -292,8 +317,8 @@ class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None
             self.measurement_noise_ |= dict(zip(names, block.sigma.tolist(), strict=True))
         by_key = {self._key(block): block for block in ordered}
         self.process_noise_ = {key: block.noise.intensity for key, block in by_key.items()}
-        self.initial_mean_ = {key: block.mean for key, block in by_key.items()}
-        self.initial_covariance_ = {key: block.covariance for key, block in by_key.items()}
+        self.initial_mean_ = {key: block.start.mean for key, block in by_key.items()}
+        self.initial_covariance_ = {k: block.start.covariance for k, block in by_key.items()}
         self.models_ = {
             key: "velocity" if block.motion.order == 1 else "acceleration"
             for key, block in by_key.items()
@@ -301,21 +326,30 @@ class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None
         }
 
     def _warn(self, ds: TrajectoryDataset, grid: Grid, estimated: list[str]) -> None:
-        low: list[str] = []
-        if estimated:
-            noise = np.array([self.measurement_noise_[name] for name in estimated])
-            columns = [ds.state_names.index(name) for name in estimated]
-            steps = np.diff(ds.states[grid.rows][..., columns], axis=0)[grid.known[1:]]
-            low = warn_filtered(estimated, noise, np.sqrt(np.mean(steps**2, axis=0)))
-        gaps = {}
+        names = list(self.measurement_noise_)
+        columns = [ds.state_names.index(name) for name in names]
+        states = ds.states[grid.rows][..., columns]
+        steps = np.diff(states, axis=0)[grid.known[1:]]
+        # what has been told of a state is not followed by its symptoms
+        told = warn_wrapped(names, states[grid.known], steps)
+        change = dict(zip(names, np.sqrt(np.mean(steps**2, axis=0)), strict=True))
+        asked = [name for name in estimated if name not in told]
+        noise = np.array([self.measurement_noise_[name] for name in asked])
+        told += warn_filtered(asked, noise, np.array([change[name] for name in asked]))
+        gaps, correlated = {}, {}
         for block in self._blocks:
             names = self._measured(block)
-            # what has next to no noise has been told
-            warn_misfit(names, np.where(np.isin(names, low), 0.0, block.moved), block.sigma)
+            moved = np.where(np.isin(names, told), 0.0, block.moved)
+            told += warn_misfit(names, moved, block.sigma)
+            following, later, n = block.correlated
+            for i, name in enumerate(names):
+                if name not in told:
+                    correlated[name] = float(following[i]), float(later[i]), n
             if isinstance(block.motion, Kinematic) and block.motion.pair:
                 gap = contradiction(Signals(ds.states[:, block.columns], grid, block.motion))
                 if gap is not None:
                     gaps[names[0], names[1]] = gap
+        warn_correlated(correlated)
         warn_contradicting(gaps)
 
     # -- the new dataset ------------------------------------------------------------------
