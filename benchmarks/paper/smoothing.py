@@ -3,8 +3,8 @@
 `KalmanSmoother` on simulated episodes whose measurement noise is known: 0, 1, 3 and 10 % of the
 standard deviation of each state. First the error of the training states, raw, filtered and
 smoothed, by state and smoother. Then forecasts of T, C (closed loop) and D with our settings,
-trained on raw and on smoothed states, on cartpole and reacher. A third training set, the true
-states, shows what a perfect smoother would give. The errors of forecasts are against the true
+trained on raw and on smoothed states, on cartpole and reacher. On cartpole a third training set,
+the true states, shows what a perfect smoother would give. The errors of forecasts are against the true
 test states; a forecast starts from the measured state, or the filter's estimate of it: the first
 state of an episode, where the filter has one measurement and the prior, or state 20, where it has
 21. The simulated quadrotor, whose process noise no filter can tell from measurement noise, is
@@ -279,8 +279,8 @@ def _forecast_cells(run: Run, chosen: dict[str, str]) -> list[dict[str, Any]]:
         for noise in NOISE[run.mode]
         for states in LABELS
         for seed in run.seeds
-        # without noise raw states are the true ones
-        if not (states == "true" and noise == 0)
+        # without noise raw states are the true ones; on the reacher they cost too much time
+        if states != "true" or (noise > 0 and task == "cartpole")
     ]
 
 
