@@ -55,9 +55,13 @@ def _summary(errors: pd.DataFrame) -> pd.DataFrame:
         for h in _AT:
             line[f"driven mm, h = {h}"] = _spread(main[main["horizon"] == h]["driven_mm"])
         far = some[(some["group"] == ALL) & (some["horizon"] == 50)]
+        for h in _AT[1:]:
+            line[f"without violent, h = {h}"] = _spread(
+                main[main["horizon"] == h]["driven_calm_mm"]
+            )
         line["median flight, h = 50"] = _spread(main[main["horizon"] == 50]["driven_median_mm"])
         line["attitude deg, h = 50"] = _spread(far["attitude_deg"])
-        line["without violent"] = _spread(far["attitude_calm_deg"])
+        line["attitude, without violent"] = _spread(far["attitude_calm_deg"])
         line["nMSE mean, h = 50"] = _spread(far["nmse"])
         line["median"] = _spread(far["nmse_median"])
         line["mean without violent"] = _spread(far["nmse_calm"])

@@ -22,7 +22,7 @@ SKILL_AT = (1, 10, 50, 200)
 GAINS = ("T, tracking error", "T, tracking error, no gains")
 _N_RESAMPLES = 1000
 # columns of the errors that groups have of their own
-_BY_GROUP = ("driven_mm", "driven_median_mm", "attitude_deg")
+_BY_GROUP = ("driven_mm", "driven_median_mm", "driven_calm_mm", "attitude_deg")
 
 
 class Errors:
@@ -128,8 +128,8 @@ def error_table(errors: Errors) -> pd.DataFrame:
 
     ``driven_mm``: root mean square over flights, along the driven axes; ``driven_median_mm``:
     median over flights of that of a flight; ``attitude_deg``: root mean square of roll, pitch and
-    yaw; ``nmse``: of the 12 states, in training ranges. With ``calm``: without the nearly unstable
-    flights. These last of all groups together only.
+    yaw; ``nmse``: of the 12 states, in training ranges, of all groups together only. With
+    ``calm``: without the nearly unstable flights.
     """
     every, lines = errors.every, []
     attitude = [STATES.index(name) for name in ATTITUDE]
@@ -144,6 +144,7 @@ def error_table(errors: Errors) -> pd.DataFrame:
                 columns = {
                     "driven_mm": 1e3 * np.sqrt(_mean(along[mine])),
                     "driven_median_mm": 1e3 * np.sqrt(_median(along[mine])),
+                    "driven_calm_mm": 1e3 * np.sqrt(_mean(along[calm])),
                     "attitude_deg": np.degrees(np.sqrt(_mean(angle[mine]))),
                     "attitude_calm_deg": np.degrees(np.sqrt(_mean(angle[calm]))),
                     "nmse": _mean(nmse[mine]),
