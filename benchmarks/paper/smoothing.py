@@ -4,11 +4,11 @@
 standard deviation of each state. First the error of the training states, raw, filtered and
 smoothed, by state and smoother. Then forecasts of T, C (closed loop) and D with our settings,
 trained on raw and on smoothed states, on cartpole and reacher. On cartpole a third training set,
-the true states, shows what a perfect smoother would give. The errors of forecasts are against the true
-test states; a forecast starts from the measured state, or the filter's estimate of it: the first
-state of an episode, where the filter has one measurement and the prior, or state 20, where it has
-21. The simulated quadrotor, whose process noise no filter can tell from measurement noise, is
-there for the states alone.
+the true states, shows what a perfect smoother would give. The errors of forecasts are against the
+true test states; a forecast starts from the measured state, or the filter's estimate of it: the
+first state of an episode, where the filter has one measurement, or state 20, where it has 21. The
+simulated quadrotor, whose process noise no filter can tell from measurement noise, is there for
+the states alone.
 
 Whether velocity or acceleration drifts is chosen by the likelihood of other training episodes,
 never by true states.
