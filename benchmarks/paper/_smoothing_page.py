@@ -208,7 +208,8 @@ def _start_states(task: str, starts: pd.DataFrame) -> list[str]:
 def error_table(errors: pd.DataFrame) -> pd.DataFrame:
     """A line a start, model and training set, a column a noise; of one task and window."""
     noises = np.sort(errors["noise"].unique())
-    orders = [np.sort(errors["start"].unique()), errors["line"].unique(), list(LABELS)]
+    there = [states for states in LABELS if (errors["states"] == states).any()]
+    orders = [np.sort(errors["start"].unique()), errors["line"].unique(), there]
     by = dict(list(errors.groupby([*_KEYS, "states", "noise"])["median"]))
     return pd.DataFrame(
         [
