@@ -312,8 +312,12 @@ def test_a_full_run_takes_both_splits_and_every_seed(few, monkeypatch):
 
     with pytest.raises(Asked):
         real_flights.run(Recorder())
-    assert len(asked) == 2 * 5 * (1 + 3 * (len(CELLS) - 1))
-    assert {cell["split"] for cell in asked} == set(SPLITS)
+    by_split = {split: [cell for cell in asked if cell["split"] == split] for split in SPLITS}
+    assert len(by_split["experiment"]) == 5 * (1 + 3 * (len(CELLS) - 1))
+    # on blocks what theta adds, and the average; of the rest one seed
+    assert len(by_split["block"]) == 5 * (len(CELLS) + 2 * 2)
+    seeds = {cell["seed"] for cell in by_split["block"] if "average" in cell["rows"]}
+    assert seeds == {0, 1, 2}
 
 
 @pytest.mark.data
