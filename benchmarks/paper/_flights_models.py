@@ -35,8 +35,8 @@ Floats = NDArray[np.float64]
 
 #: Gradient steps; those of the paper's T are its epochs in full mode.
 STEPS = {
-    "full": {"T": 4000, "C": 2500, "D": 2500, "LSTM": 250},
-    "quick": {"T": 800, "C": 800, "D": 800, "LSTM": 60},
+    "full": {"T": 4000, "T, long": 8000, "C": 2500, "D": 2500, "LSTM": 250},
+    "quick": {"T": 800, "T, long": 1600, "C": 800, "D": 800, "LSTM": 60},
 }
 #: Rows that do not depend on a seed.
 FIXED = ("hold", "reference", "mean flight", "kernel ridge", "kernel ridge + linear")
@@ -50,10 +50,13 @@ AVERAGE = [
     "average",
 ]
 NO_GAINS = ["T, tracking error, no gains"]
+#: Twice the steps of the other T rows.
+LONG = ["T, tracking error, long training"]
 CELLS = [
     ["hold", "reference", "mean flight"],
     AVERAGE,
     NO_GAINS,
+    LONG,
     ["T, state"],
     ["T, paper"],
     ["D, logged actions"],
@@ -91,7 +94,7 @@ def build(row: str, mode: str, seed: int) -> Any:
         model = paper.model("T", relabeler=rows, random_state=seed)
         return model.set_params(estimator__max_epochs=1) if mode == "quick" else model
     if row.startswith("T, "):
-        return _trajectory(row, steps["T"], seed)
+        return _trajectory(row, steps["T, long" if row in LONG else "T"], seed)
     if row == "C":
         model = OneStepRegressor(inputs="params", baseline=follow, random_state=seed)
         return model.set_params(

@@ -55,7 +55,7 @@ def seeds_of(rows: list[str], split: str, seeds: list[int]) -> list[int]:
 
     What theta adds to T, and the members of the average, have all seeds on both splits.
     """
-    every = rows in (models.AVERAGE, models.NO_GAINS)
+    every = rows in (models.AVERAGE, models.NO_GAINS, models.LONG)
     varied = rows != models.CELLS[0] and (every or split == "experiment")
     return seeds if varied else seeds[:1]
 

@@ -315,7 +315,7 @@ def test_a_full_run_takes_both_splits_and_every_seed(few, monkeypatch):
     by_split = {split: [cell for cell in asked if cell["split"] == split] for split in SPLITS}
     assert len(by_split["experiment"]) == 5 * (1 + 3 * (len(CELLS) - 1))
     # on blocks what theta adds, and the average; of the rest one seed
-    assert len(by_split["block"]) == 5 * (len(CELLS) + 2 * 2)
+    assert len(by_split["block"]) == 5 * (len(CELLS) + 2 * 3)
     seeds = {cell["seed"] for cell in by_split["block"] if "average" in cell["rows"]}
     assert seeds == {0, 1, 2}
 
