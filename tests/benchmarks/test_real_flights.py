@@ -84,7 +84,7 @@ def few(monkeypatch):
 
 @pytest.fixture
 def short(monkeypatch):
-    tiny = {"T": 20, "C": 20, "D": 20, "LSTM": 2}
+    tiny = {"T": 20, "T, long": 20, "C": 20, "D": 20, "LSTM": 2}
     monkeypatch.setitem(_flights_models.STEPS, "quick", tiny)
     monkeypatch.setattr(_flights_data, "STRIDE", 70)
     monkeypatch.setattr(_flights_ranking, "N_BOOTSTRAP", 10)
