@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from trajlearn.dynamics._base import TwoDoorRegressor
-from trajlearn.dynamics._forecaster import Forecaster, Prediction
+from trajlearn.dynamics._forecaster import Forecaster, Prediction, Request
 from trajlearn.dynamics._planned import broadcast, by_episode, planned
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics._relative import ahead, curve, fit_baseline, relative_to
@@ -39,16 +39,7 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
         """Fit on episodes whose states are relative to the baseline, if there is one."""
 
     @abstractmethod
-    def _forecast_states(
-        self,
-        query: Query,
-        *,
-        actions: str,
-        policy: Any,
-        return_std: bool,
-        n_samples: int | None,
-        rng: np.random.Generator,
-    ) -> Prediction:
+    def _forecast_states(self, query: Query, request: Request) -> Prediction:
         """Predict the states of a query, relative to the baseline."""
 
     # -- fitting --------------------------------------------------------------------------
@@ -81,16 +72,7 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
 
     # -- prediction -----------------------------------------------------------------------
 
-    def _forecast(
-        self,
-        query: Query,
-        *,
-        actions: str,
-        policy: Any,
-        return_std: bool,
-        n_samples: int | None,
-        rng: np.random.Generator,
-    ) -> Prediction:
+    def _forecast(self, query: Query, request: Request) -> Prediction:
         base = None
         if self.baseline_ is not None:
             states = curve(self.baseline_, query.ds)
@@ -103,14 +85,7 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
                 ds=relative_to(query.ds, states, told=self._told()),
                 base=np.concatenate([start, np.where(np.isfinite(base), base, 0.0)], axis=1),
             )
-        prediction = self._forecast_states(
-            query,
-            actions=actions,
-            policy=policy,
-            return_std=return_std,
-            n_samples=n_samples,
-            rng=rng,
-        )
+        prediction = self._forecast_states(query, request)
         if base is not None:
             prediction.mean = prediction.mean + base
             if prediction.samples is not None:

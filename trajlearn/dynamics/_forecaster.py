@@ -17,7 +17,7 @@ from trajlearn.trajectories import TrajectoryDataset, as_dataset
 from trajlearn.trajectories._relabeler import generator
 from trajlearn.trajectories.rewards import Reward, step_rewards
 
-__all__ = ["DIVERGENCE_RANGES", "Forecaster", "Prediction"]
+__all__ = ["DIVERGENCE_RANGES", "Forecaster", "Prediction", "Request"]
 
 Floats = NDArray[np.float64]
 
@@ -35,6 +35,17 @@ class Prediction:
     actions: str = "none"
 
 
+@dataclass(frozen=True)
+class Request:
+    """How a query is to be answered: the arguments of `forecast` that say so."""
+
+    actions: str
+    policy: Any
+    return_std: bool
+    n_samples: int | None
+    rng: np.random.Generator
+
+
 class Forecaster(BaseEstimator):
     """Anything that predicts future states from the past of an episode."""
 
@@ -46,16 +57,7 @@ class Forecaster(BaseEstimator):
     _needs_constant_params = False
 
     @abstractmethod
-    def _forecast(
-        self,
-        query: Query,
-        *,
-        actions: str,
-        policy: Any,
-        return_std: bool,
-        n_samples: int | None,
-        rng: np.random.Generator,
-    ) -> Prediction:
+    def _forecast(self, query: Query, request: Request) -> Prediction:
         """Predict the states of a query."""
 
     def _reads_logged_future(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
@@ -144,14 +146,8 @@ class Forecaster(BaseEstimator):
         self._warn_hindsight(ds)
         self._warn_beyond_training(query)
         rng = np.random.default_rng() if random_state is None else generator(random_state)
-        prediction = self._forecast(
-            query,
-            actions=actions,
-            policy=policy,
-            return_std=return_std,
-            n_samples=n_samples,
-            rng=rng,
-        )
+        request = Request(actions, policy, return_std, n_samples, rng)
+        prediction = self._forecast(query, request)
         return self._as_forecast(query, prediction, episode)
 
     def _score_episodes(self, X: Any, sample_weight: Any) -> float:

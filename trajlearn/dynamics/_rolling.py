@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from trajlearn._sklearn import HasMethods, Interval, StrOptions
 from trajlearn.dynamics._base import TwoDoorRegressor
 from trajlearn.dynamics._dynamics import DynamicsEstimator
-from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES, Prediction
+from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES, Prediction, Request
 from trajlearn.dynamics._learner import spread
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics._rollout import InputRows, Limits, Step, roll_out
@@ -167,17 +167,8 @@ class RollingEstimator(DynamicsEstimator):
                 'Resample them (ds.resample), or fit with "dt" among inputs=.'
             )
 
-    def _forecast_states(
-        self,
-        query: Query,
-        *,
-        actions: str,
-        policy: Any,
-        return_std: bool,
-        n_samples: int | None,
-        rng: np.random.Generator,
-    ) -> Prediction:
-        source, policy = self._source(query.ds, actions, policy)
+    def _forecast_states(self, query: Query, request: Request) -> Prediction:
+        source, policy = self._source(query.ds, request.actions, request.policy)
         self._check_time_step(query.ds)
 
         def rolled_out(copies: int, rng: np.random.Generator | None) -> Floats:
@@ -190,16 +181,16 @@ class RollingEstimator(DynamicsEstimator):
             )
 
         prediction = Prediction(rolled_out(1, None), actions=source)
-        n_paths = max(n_samples or 0, self.n_particles if return_std else 0)
+        n_paths = max(request.n_samples or 0, self.n_particles if request.return_std else 0)
         if not n_paths:
             return prediction
-        paths = rolled_out(n_paths, rng).reshape(n_paths, *prediction.mean.shape)
-        if return_std:
+        paths = rolled_out(n_paths, request.rng).reshape(n_paths, *prediction.mean.shape)
+        if request.return_std:
             with np.errstate(invalid="ignore"):
                 std = paths.std(axis=0)
             prediction.std = np.where(np.isinf(paths).any(axis=0), np.inf, std)
-        if n_samples:
-            prediction.samples = paths[:n_samples].copy()
+        if request.n_samples:
+            prediction.samples = paths[: request.n_samples].copy()
         return prediction
 
     def _limits(self) -> Limits:

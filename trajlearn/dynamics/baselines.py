@@ -10,7 +10,7 @@ from sklearn.utils import Tags
 
 from trajlearn._persistence import SaveMixin
 from trajlearn._sklearn import fit_context
-from trajlearn.dynamics._forecaster import Forecaster, Prediction
+from trajlearn.dynamics._forecaster import Forecaster, Prediction, Request
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.exceptions import MissingFieldError
@@ -97,8 +97,8 @@ class EpisodeForecaster(SaveMixin, Forecaster):
     def _learn(self, ds: TrajectoryDataset) -> None:
         """Learn from episodes; nothing by default."""
 
-    def _refuse_uncertainty(self, return_std: bool, n_samples: int | None) -> None:
-        if return_std or n_samples:
+    def _refuse_uncertainty(self, request: Request) -> None:
+        if request.return_std or request.n_samples:
             raise ValueError(
                 f"{type(self).__name__} gives no uncertainty: leave return_std= and n_samples= out."
             )
@@ -116,17 +116,8 @@ class HoldForecaster(EpisodeForecaster):
     array([1., 1.])
     """
 
-    def _forecast(
-        self,
-        query: Query,
-        *,
-        actions: str,
-        policy: Any,
-        return_std: bool,
-        n_samples: int | None,
-        rng: np.random.Generator,
-    ) -> Prediction:
-        self._refuse_uncertainty(return_std, n_samples)
+    def _forecast(self, query: Query, request: Request) -> Prediction:
+        self._refuse_uncertainty(request)
         return Prediction(np.repeat(query.initial_states[:, None], query.n_steps, axis=1))
 
 
@@ -178,17 +169,8 @@ class CurveForecaster(EpisodeForecaster):
         """
         return self.at(ds, np.repeat(np.arange(len(ds)), ds.lengths + 1), ds.times)
 
-    def _forecast(
-        self,
-        query: Query,
-        *,
-        actions: str,
-        policy: Any,
-        return_std: bool,
-        n_samples: int | None,
-        rng: np.random.Generator,
-    ) -> Prediction:
-        self._refuse_uncertainty(return_std, n_samples)
+    def _forecast(self, query: Query, request: Request) -> Prediction:
+        self._refuse_uncertainty(request)
         n, n_steps = query.times.shape
         times = np.where(query.known(), query.times, query.initial_times[:, None])
         states = self.at(query.ds, np.repeat(np.arange(n), n_steps), times.ravel())

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from trajlearn._sklearn import HasMethods, Interval, StrOptions
 from trajlearn.dynamics._base import TwoDoorRegressor
 from trajlearn.dynamics._dynamics import DynamicsEstimator
-from trajlearn.dynamics._forecaster import Prediction
+from trajlearn.dynamics._forecaster import Prediction, Request
 from trajlearn.dynamics._learner import mixture, required, spread, takes_weights
 from trajlearn.dynamics._query import Query, make_query
 from trajlearn.dynamics.scaling import BlockScaler, HorizonFeatures, PhaseFeatures
@@ -232,11 +232,10 @@ class TrajectoryRegressor(DynamicsEstimator):
         start = rows[:, self.layout_["state"]] if change else 0.0
         self.target_scale_ = spread(targets - start, largest, weight)
 
-    def _anchor(self, rows: Floats, gate: Floats) -> Floats | float:
+    def _anchor(self, start: Floats, gate: Floats) -> Floats | float:
         """Where a prediction is while the gate is shut: at the start, or leaving it."""
         if not self._anchored:
             return 0.0
-        start = rows[:, self.layout_["state"]]
         return start if self.baseline_ is None else (1 - gate) * start
 
     def _gate(self, rows: Floats) -> Floats:
@@ -252,14 +251,17 @@ class TrajectoryRegressor(DynamicsEstimator):
         if not takes_weights(self.estimator_):
             gate = np.ones_like(gate)
         self._gated = takes_weights(self.estimator_)
-        z = (targets - self._anchor(rows, gate)) / (gate * self.target_scale_)
+        z = (targets - self._anchor(rows[:, self.layout_["state"]], gate)) / (
+            gate * self.target_scale_
+        )
         # the squared error of the state, not of z
         return z, gate[:, 0] ** 2 if (gate != 1).any() else None
 
     def _restore(self, rows: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:
         gate = self._gate(rows) if self._gated else np.ones((len(rows), 1))
         scale = gate * self.target_scale_
-        return self._anchor(rows, gate) + scale * means, scale**2 * variances
+        anchor = self._anchor(rows[:, self.layout_["state"]], gate)
+        return anchor + scale * means, scale**2 * variances
 
     def _learn_noise_time(self, ds: TrajectoryDataset) -> None:
         """Correlation time of standardised residuals along training episodes, by state."""
@@ -284,24 +286,17 @@ class TrajectoryRegressor(DynamicsEstimator):
     def _reads_logged_future(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
         return "references" in self.layout_
 
-    def _forecast_states(
-        self,
-        query: Query,
-        *,
-        actions: str,
-        policy: Any,
-        return_std: bool,
-        n_samples: int | None,
-        rng: np.random.Generator,
-    ) -> Prediction:
+    def _forecast_states(self, query: Query, request: Request) -> Prediction:
         means, variances = self._at(query)
         prediction = Prediction(mean_of_members(means))
-        if return_std or n_samples:
+        if request.return_std or request.n_samples:
             variances = required(variances, self.estimator_)
             std = np.sqrt(mixture(means, variances, self.estimator_)[1])
-            prediction.std = std if return_std else None
-        if n_samples and variances is not None:
-            prediction.samples = self._sample(query, means, variances, n_samples, rng)
+            prediction.std = std if request.return_std else None
+        if request.n_samples and variances is not None:
+            prediction.samples = self._sample(
+                query, means, variances, request.n_samples, request.rng
+            )
         return prediction
 
     def _at(self, query: Query) -> tuple[Floats, Floats | None]:
@@ -380,10 +375,7 @@ class TrajectoryRegressor(DynamicsEstimator):
         gate = self._gate(right) if self._gated else np.ones((len(right), 1))
         gate = gate.reshape(*horizons.shape, 1)
         scale = gate * self.target_scale_
-        anchor: Floats | float = 0.0
-        if self._anchored:
-            start_states = query.initial_states[some, None]
-            anchor = start_states if self.baseline_ is None else (1 - gate) * start_states
+        anchor = self._anchor(query.initial_states[some, None], gate)
         return anchor + scale * means, scale**2 * variances
 
     def _looked_at(self, grid: Floats, chosen: NDArray[np.intp]) -> tuple[Floats, NDArray[np.intp]]:
