@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sklearn.dummy import DummyRegressor
 from sklearn.exceptions import NotFittedError
 from sklearn.frozen import FrozenEstimator
 from sklearn.linear_model import LinearRegression
@@ -195,6 +196,26 @@ def test_another_estimator_as_baseline():
     model = small(baseline=inner).fit(train)
     assert model.baseline_ is not inner
     assert error(model, test) < error(inner.fit(train), test)
+
+
+@pytest.mark.parametrize("start", [0, 7])
+def test_with_nothing_learned_a_forecast_is_that_of_the_baseline(start):
+    """From the first state of the episode on, wherever the forecast starts."""
+    ds = tracking(n=6)
+    inner = OneStepRegressor(LinearRegression(), inputs="params")
+    nothing = DummyRegressor(strategy="constant", constant=0.0)
+    model = TrajectoryRegressor(nothing, baseline=inner, gate=None, random_state=0).fit(ds)
+    from_first = inner.fit(ds).predict(ds).mean
+    found = model.predict(ds, start=start, horizon=20).mean
+    np.testing.assert_allclose(found, from_first[:, start : start + 20], atol=1e-9)
+
+
+def test_samples_and_their_spread_are_about_the_mean():
+    ds = tracking(n=6, lag=5.0)
+    model = small(baseline=same).set_params(estimator__max_steps=50).fit(ds)
+    forecast = model.predict(ds, horizon=9, return_std=True, n_samples=300, random_state=0)
+    off = np.abs(forecast.samples.mean(axis=0) - forecast.mean)
+    assert (off < 0.4 * forecast.std + 1e-9).all()
 
 
 # -- known signals ------------------------------------------------------------------------
