@@ -1,4 +1,4 @@
-"""The notebook on real flights, run on a few of them; the others run when the pages are built."""
+"""Notebooks on real flights and on uncertainty, run small; all run when the pages are built."""
 
 import json
 import os
@@ -28,6 +28,30 @@ print(json.dumps({
 """
 
 
+FOUND_OF_UNCERTAINTY = """
+import json
+
+
+def coverage(level):
+    table = overview(reports, "coverage").xs(f"{level:g}", level="level").droplevel("measure")
+    return {name: row.tolist() for name, row in table.iterrows()}
+
+
+print(json.dumps({
+    "n_episodes": [len(episodes), len(train), len(test)],
+    "in both": np.intersect1d(chosen, held_back).tolist(),
+    "n_steps": int(test.lengths.max()),
+    "coverage": {level: coverage(level) for level in levels},
+    "bands": rows,
+    "reward": table,
+    "trust": {" / ".join(key): value for key, value in answers.items()},
+    "schemes": {name: by_scheme[name]["value"].tolist() for name in by_scheme},
+    "infinite": [bool(np.isinf(upper).all()), str(caught[0].message)],
+    "cases": {name: overview({name: r}, "coverage").min(axis=None) for name, r in found.items()},
+}, default=float))
+"""
+
+
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_no_outputs_are_stored(path):
     cells = nbformat.read(path, as_version=4).cells
@@ -36,17 +60,29 @@ def test_no_outputs_are_stored(path):
     assert not any(cell.outputs or cell.execution_count for cell in code)
 
 
-@pytest.fixture(scope="module")
-def found(data_folder):
-    """Results of the notebook on 40 flights; an error in a cell is an error here."""
-    folder = data_folder("crazyflie_lee_gains").parent
-    notebook = nbformat.read(ROOT / "notebooks" / "real_flights.ipynb", as_version=4)
-    notebook.cells.append(nbformat.v4.new_code_cell(FOUND))
+def told_by(name, last_cell, settings):
+    """What a last cell of its own prints about a notebook; an error in a cell is an error here."""
+    notebook = nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4)
+    notebook.cells.append(nbformat.v4.new_code_cell(last_cell))
     client = NotebookClient(notebook, timeout=300, kernel_name="python3")
-    own = {"TRAJLEARN_FLIGHTS": str(folder), "TRAJLEARN_NOTEBOOK_FLIGHTS": "40"}
-    client.execute(env=os.environ | own)
+    client.execute(env=os.environ | settings)
     told = "".join(o.text for o in notebook.cells[-1].outputs if o.get("name") == "stdout")
     return json.loads(told)
+
+
+@pytest.fixture(scope="module")
+def found(data_folder):
+    """Results of the notebook on 40 flights."""
+    folder = data_folder("crazyflie_lee_gains").parent
+    settings = {"TRAJLEARN_FLIGHTS": str(folder), "TRAJLEARN_NOTEBOOK_FLIGHTS": "40"}
+    return told_by("real_flights", FOUND, settings)
+
+
+@pytest.fixture(scope="module")
+def uncertainty():
+    """Results of the notebook on 110 short episodes."""
+    settings = {"TRAJLEARN_NOTEBOOK_EPISODES": "110"}
+    return told_by("uncertainty", FOUND_OF_UNCERTAINTY, settings)
 
 
 def test_real_flights_runs_on_a_few(found):
@@ -74,3 +110,73 @@ def test_proposed_gains_lie_between_flown_ones(found, data_folder):
     assert (flown[:, None] == ds.params).all(axis=2).any(axis=1).all()
     # and none is a flown setting again
     assert not (proposed[:, None] == flown).all(axis=2).any()
+
+
+def test_uncertainty_splits_by_episode(uncertainty):
+    n, n_train, n_test = uncertainty["n_episodes"]
+    assert n == n_train + n_test == 110
+    assert n_test >= 29  # fewer could not show 90 % with a confidence of 95 %
+    assert uncertainty["in both"] == []
+
+
+def test_calibrated_intervals_hold_what_they_promise_better_than_raw_ones(uncertainty):
+    off = {
+        name: np.mean(
+            [
+                np.abs(np.array(by_model[name]) - float(level)).mean()
+                for level, by_model in uncertainty["coverage"].items()
+            ]
+        )
+        for name in uncertainty["coverage"]["0.9"]
+    }
+    assert set(off) == {
+        f"{model}, {kind}" for model in ("T", "PE") for kind in ("raw", "calibrated")
+    }
+    for model in ("T", "PE"):
+        assert off[f"{model}, calibrated"] < off[f"{model}, raw"]
+        at_90 = uncertainty["coverage"]["0.9"][f"{model}, calibrated"]
+        assert all(0.75 < share < 1 for share in at_90)
+
+
+def test_only_a_simultaneous_band_holds_whole_episodes(uncertainty):
+    marginal, simultaneous = (uncertainty["bands"][b] for b in ("marginal", "simultaneous"))
+    whole = "episodes inside all the way"
+    assert marginal[whole] < 0.3
+    assert simultaneous[whole] > 0.7
+    (width,) = [name for name in marginal if name.startswith("mean width")]
+    assert simultaneous[width] > marginal[width] > 0
+
+
+def test_rewards_need_whole_trajectories(uncertainty):
+    for values in uncertainty["reward"].values():
+        assert values["calibrated"] > 0.6 > values["calibrated, steps shuffled"]
+
+
+def test_trust_horizons_of_the_notebook(uncertainty):
+    n_steps, trust = uncertainty["n_steps"], uncertainty["trust"]
+    assert len(trust) == 2 * 4
+    for answer in trust.values():
+        steps, easier = answer["steps, 90 % of episodes"], answer["steps, 80 % of episodes"]
+        assert 0 <= steps <= easier <= n_steps
+        assert steps == int(steps)
+        assert answer["seconds"] == pytest.approx(0.02 * steps)
+        assert answer["ends by"] in {"tolerance", "episodes", "forecast"}
+    for model in ("T", "PE"):
+        of_model = {
+            name.removeprefix(f"{model} / "): answer["steps, 90 % of episodes"]
+            for name, answer in trust.items()
+            if name.startswith(f"{model} / ")
+        }
+        single = [steps for name, steps in of_model.items() if "±" in name]
+        assert of_model["all of these"] <= min(single)
+    assert max(answer["steps, 90 % of episodes"] for answer in trust.values()) > 0
+
+
+def test_propagations_and_pitfalls_of_the_notebook(uncertainty):
+    schemes = uncertainty["schemes"]
+    assert set(schemes) == {"tsinf", "ts1", "expectation", "moment", "unscented"}
+    assert len({tuple(values) for values in schemes.values()}) == len(schemes)
+    infinite, warning = uncertainty["infinite"]
+    assert infinite
+    assert "19 or more calibration episodes" in warning
+    assert all(0.7 < share <= 1 for share in uncertainty["cases"].values())

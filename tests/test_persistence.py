@@ -23,6 +23,7 @@ from trajlearn import (
     DirectRewardGP,
     DirectRewardNN,
     GPRegressor,
+    HoldForecaster,
     LinearFeedback,
     MLPEnsembleRegressor,
     OneStepRegressor,
@@ -33,6 +34,7 @@ from trajlearn import (
     load,
 )
 from trajlearn._persistence import save
+from trajlearn.dynamics.calibrated import CalibratedForecaster
 from trajlearn.exceptions import UnknownFileError
 
 
@@ -77,6 +79,11 @@ MODELS = [
     d(inputs=("action", "params", "dt"), clip_states=2.0, propagation="ts1"),
     DirectRewardGP(GPRegressor(n_restarts=0), reward=squared, random_state=0),
     DirectRewardNN(reward=squared, random_state=0).set_params(**SMALL),
+    CalibratedForecaster(t(), cv=0.5, random_state=0),
+    CalibratedForecaster(band="simultaneous", cv=2, random_state=0).set_params(
+        **{f"estimator__{name}": value for name, value in SMALL.items()}
+    ),
+    CalibratedForecaster(HoldForecaster(), method="variance", cv=0.5, random_state=0),
 ]
 
 

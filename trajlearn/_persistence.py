@@ -40,6 +40,10 @@ _CLASSES = {
             "ReferenceForecaster",
             "TrajectoryRegressor",
         ),
+        "trajlearn.dynamics._calibration": ("Rescaling",),
+        "trajlearn.dynamics._conformal": ("ConformalBands",),
+        "trajlearn.dynamics.calibrated": ("CalibratedForecaster",),
+        "trajlearn.dynamics._residual_paths": ("ResidualPaths",),
         "trajlearn.dynamics._sequence": ("SequenceLearner",),
         "trajlearn.regressors": ("GPRegressor", "MLPEnsembleRegressor"),
         "trajlearn.trajectories": (

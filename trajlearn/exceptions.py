@@ -4,6 +4,7 @@ Errors are small subclasses of `ValueError`, so that ``except ValueError`` keeps
 """
 
 __all__ = [
+    "CalibrationWarning",
     "DivergenceWarning",
     "HorizonWarning",
     "InvalidEpisodeError",
@@ -28,6 +29,10 @@ class MixedSamplingError(ValueError):
 
 class UnknownFileError(ValueError):
     """A file is not one of this package's, was truncated or was changed by hand."""
+
+
+class CalibrationWarning(UserWarning):
+    """An interval or a standard deviation goes beyond what the calibration episodes say."""
 
 
 class DivergenceWarning(UserWarning):

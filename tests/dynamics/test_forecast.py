@@ -7,6 +7,8 @@ import pytest
 from scipy.stats import norm
 
 from trajlearn import Forecast, TrajectoryDataset
+from trajlearn.dynamics._calibration import Residuals
+from trajlearn.dynamics._conformal import marginal_bands
 
 
 def make(lengths=(3, 2, 4), *, n_steps=None, diverged=(0, 0, 0), seed=0, samples=5, **changes):
@@ -147,9 +149,28 @@ def test_gaussian_intervals_hold_their_share():
 def test_intervals_of_samples_are_their_quantiles():
     forecast = make(samples=2001)
     lower, upper = forecast.interval(0.5)
-    np.testing.assert_allclose(upper, np.quantile(forecast.samples, 0.75, axis=0))
+    np.testing.assert_allclose(upper, np.quantile(forecast.samples, 0.75, axis=0, method="weibull"))
     assert 0.45 < np.nanmean(lower < 0) < 1
     assert np.isnan(lower[1, 2:]).all()
+
+
+def test_intervals_of_few_samples_cover_what_they_say():
+    draws = np.random.default_rng(0).normal(size=(20, 1, 4000, 1))
+    forecast = make(lengths=(4000,), diverged=(0,), samples=20)
+    forecast.samples = draws[:, :, :, [0, 0]]
+    lower, upper = forecast.interval(0.8)
+    # the probability of a standard normal between them, on average over draws
+    inside = norm.cdf(upper) - norm.cdf(lower)
+    np.testing.assert_allclose(inside.mean(), 0.8, atol=0.005)
+
+
+def test_intervals_are_unbounded_where_samples_diverged():
+    forecast = make(samples=20)
+    forecast.samples[:12, 0, 1:] = np.inf
+    lower, upper = forecast.interval(0.8)
+    assert np.isfinite(lower[0, 0]).all()
+    assert np.isinf(upper[0, 1:]).all()
+    assert not np.isnan(lower[0]).any()
 
 
 @pytest.mark.parametrize("level", [0, 1, 1.5, -0.1])
@@ -161,6 +182,53 @@ def test_a_level_is_a_probability(level):
 def test_without_uncertainty_there_is_no_interval():
     with pytest.raises(ValueError, match="return_std=True or n_samples="):
         make(std=None, samples=0).interval()
+
+
+def bands(n, size):
+    """Shared by n forecasts: 9 scores of `size` at up to 4 steps of two states."""
+    elapsed = 0.5 * np.arange(1, 5)
+    scores = Residuals(np.full((9, 4, 2), size), np.ones((9, 4, 2)), np.tile(elapsed, (9, 1)))
+    one = marginal_bands(scores, elapsed)
+    return np.full(n, one, dtype=object)
+
+
+def test_bands_come_before_samples():
+    raw_std = 2 * make().std
+    forecast = make(bands=bands(3, 3.0), raw_std=raw_std)
+    lower, upper = forecast.interval(0.9)
+    known = ~np.isnan(forecast.mean)
+    np.testing.assert_allclose(upper, forecast.mean + 3 * raw_std)
+    np.testing.assert_allclose(lower, forecast.mean - 3 * raw_std)
+    assert np.isfinite(upper[known]).all()
+    assert np.isnan(upper[~known]).all()
+    # they scale a std, and are of no use without one
+    without = make(bands=bands(3, 3.0))
+    np.testing.assert_array_equal(without.interval(0.9), make().interval(0.9))
+
+
+def test_bands_go_along():
+    first, second = (
+        make(bands=bands(3, size), raw_std=size * make().std, seed=seed)
+        for seed, size in enumerate((1.0, 2.0))
+    )
+    joined = np.concatenate([first, second])
+    width = (joined.interval(0.5)[1] - joined.mean) / joined.raw_std
+    np.testing.assert_allclose(width[:3][~np.isnan(width[:3])], 1.0)
+    np.testing.assert_allclose(width[3:][~np.isnan(width[3:])], 2.0)
+    np.testing.assert_array_equal(joined[[4, 0]].interval(0.5)[0], joined.interval(0.5)[0][[4, 0]])
+    np.testing.assert_array_equal(
+        joined.at([2, 3]).interval(0.5)[0], joined.interval(0.5)[0][:, [1, 2]]
+    )
+    assert repr(first) == "Forecast(n=3, H=4, d_s=2, std, samples=5, bands)"
+    assert np.concatenate([first, make()]).bands is None
+
+
+def test_residuals_are_logged_minus_predicted():
+    forecast = make(diverged=(0, 0, 3))
+    residuals = forecast.residuals(logged(forecast))
+    np.testing.assert_array_equal(residuals[0, :3], -forecast.mean[0, :3])
+    assert np.isnan(residuals[1, 2:]).all()
+    assert np.isposinf(residuals[2, 2:]).all()
 
 
 def test_squared_errors_are_in_training_ranges():

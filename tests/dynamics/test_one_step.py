@@ -336,7 +336,7 @@ def test_error_score_is_what_a_diverged_episode_counts():
 
 
 @pytest.mark.parametrize("std", [0.5, 0.0])
-@pytest.mark.parametrize("propagation", ["tsinf", "ts1"])
+@pytest.mark.parametrize("propagation", ["tsinf", "ts1", "expectation"])
 def test_std_of_a_linear_gaussian_system_is_the_closed_form(std, propagation):
     # s' = 0.8 s + noise: the change is learned as -0.2 s, in units of target_scale_
     ds = TrajectoryDataset.from_arrays(
@@ -376,9 +376,7 @@ def test_feedback_damps_the_noise_of_every_particle():
     np.testing.assert_allclose(closed, expected, rtol=0.06)
 
 
-def test_expectation_has_no_uncertainty_and_learners_without_std_none():
-    with pytest.raises(ValueError, match="expectation"):
-        mlp(propagation="expectation").fit(linear()).predict(linear(), return_std=True)
+def test_learners_without_std_have_no_uncertainty():
     with pytest.raises(ValueError, match="no standard deviation"):
         ols().fit(linear()).predict(linear(), return_std=True)
 
@@ -405,10 +403,13 @@ def _forecast(model, **settings):
         {"policy": gain_policy, "rollout_actions": "policy"},
         {"clip_states": 0.2},
         {"propagation": "ts1"},
+        {"propagation": "expectation"},
+        {"propagation": "moment"},
+        {"propagation": "unscented"},
         {"n_particles": 20},
         {"random_state": 1},
     ],
-    ids=lambda change: "+".join(change),
+    ids=lambda change: "+".join(f"{k}={v}" if k == "propagation" else k for k, v in change.items()),
 )
 def test_every_parameter_changes_the_forecast(change):
     members = {"estimator__n_members": 3}

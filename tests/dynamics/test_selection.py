@@ -248,7 +248,7 @@ def test_parameters_of_the_wrong_kind_are_refused(Model, wrong, ds):
         (OneStepRegressor(policy=3), "policy"),
         (OneStepRegressor(rollout_actions="both"), "rollout_actions"),
         (OneStepRegressor(clip_states=0.0), "clip_states"),
-        (OneStepRegressor(propagation="moment"), "propagation"),
+        (OneStepRegressor(propagation="ts2"), "propagation"),
         (OneStepRegressor(n_particles=1), "n_particles"),
         (OneStepRegressor(inputs="everything"), "inputs"),
         (DirectRewardGP(reward="squared"), "reward"),

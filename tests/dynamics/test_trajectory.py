@@ -4,6 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 from sklearn.dummy import DummyRegressor
 from sklearn.ensemble import RandomForestRegressor
 from sklearn.linear_model import LinearRegression
@@ -277,7 +278,8 @@ def test_the_noise_time_is_that_of_the_residuals(dt, correlation):
 
 
 def test_every_sample_is_one_member():
-    model = small(estimator__n_members=2, estimator__max_steps=100).fit(linear(20))
+    members = {"estimator__n_members": 2, "estimator__probabilistic": False}
+    model = small(estimator__max_steps=100, **members).fit(linear(20))
     model.estimator_.residual_std_ *= 0
     ds = linear(3, seed=1)
     samples = model.predict(ds, n_samples=6, random_state=0).samples
@@ -296,6 +298,59 @@ def test_std_is_that_of_rows():
     forecast = model.predict(ds, return_std=True)
     np.testing.assert_allclose(forecast.mean[0], mean, atol=1e-6)
     np.testing.assert_allclose(forecast.std[0], std, rtol=1e-5)
+
+
+def test_the_default_learns_how_wide_to_be_at_every_horizon():
+    ds = oscillators(30, 11).add_noise(0.1, random_state=1)
+    test = oscillators(30, 21).add_noise(0.1, random_state=51)
+    settings = {"estimator__hidden_layer_sizes": (32, 32), "estimator__batch_size": 128}
+
+    def gap_and_crps(**kind):
+        model = TrajectoryRegressor(random_state=0)
+        model.set_params(estimator__max_steps=400, **settings, **kind)
+        forecast = model.fit(ds).predict(test, return_std=True)
+        z = (truth(test) - forecast.mean) / forecast.std
+        inside = (np.abs(z) < 1.645).mean(axis=(0, 2))
+        coverage = [part.mean() for part in np.split(inside, [2, 6, 15])]
+        score = z * (2 * norm.cdf(z) - 1) + 2 * norm.pdf(z) - np.pi**-0.5
+        return np.abs(np.subtract(coverage, 0.9)).mean(), (forecast.std * score).mean()
+
+    gap, crps = gap_and_crps()
+    one_for_all = gap_and_crps(estimator__probabilistic=False)
+    assert gap < 0.08
+    assert gap < 0.6 * one_for_all[0]
+    assert crps < 0.98 * one_for_all[1]
+
+
+@pytest.mark.parametrize("settings", [{}, {"fresh_batches": False}, {"scaler": StandardScaler()}])
+def test_the_mean_of_the_default_is_to_the_bit_that_of_a_plain_learner(settings):
+    ds, test = linear(10), linear(4, seed=1, longest=8)
+    default, plain = small(**settings), small(estimator__probabilistic=False, **settings)
+    mean = default.fit(ds).predict(test).mean
+    assert default.estimator_.probabilistic == "separate"
+    np.testing.assert_array_equal(mean, plain.fit(ds).predict(test).mean)
+    # whether or not the variances are computed with it
+    np.testing.assert_array_equal(mean, default.predict(test, return_std=True).mean)
+    some = {"params": ds.params[:2], "horizons": [1.0, 2.5]}
+    found = default.predict_trajectory(np.zeros((2, 2)), **some).mean
+    expected = plain.predict_trajectory(np.zeros((2, 2)), return_std=True, **some).mean
+    np.testing.assert_array_equal(found, expected)
+
+
+def test_means_alone_take_no_network_of_variances(monkeypatch):
+    ds = linear(10)
+    model = small().fit(ds)
+    asked = []
+    predictor = MLPEnsembleRegressor.predictor
+
+    def spy(self, *, means_only=False):
+        asked.append(means_only)
+        return predictor(self, means_only=means_only)
+
+    monkeypatch.setattr(MLPEnsembleRegressor, "predictor", spy)
+    for arguments in ({}, {"return_std": True}, {"n_samples": 2}):
+        model.predict(ds, **arguments)
+    assert asked == [True, False, False]
 
 
 # -- parameters ---------------------------------------------------------------------------

@@ -3,12 +3,14 @@ import pickle
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from sklearn.linear_model import LinearRegression, Ridge
-from sklearn.model_selection import GridSearchCV, GroupKFold, cross_validate
+from sklearn.linear_model import BayesianRidge, LinearRegression, Ridge
+from sklearn.model_selection import GridSearchCV, GroupKFold, cross_val_score, cross_validate
 from sklearn.pipeline import make_pipeline
 
 from trajlearn import MLPEnsembleRegressor, TrajectoryRegressor
 from trajlearn.evaluation import horizon_scorer
+from trajlearn.evaluation.scorers import crps_scorer
+from trajlearn.evaluation.uncertainty import crps
 
 
 def test_score_is_minus_the_mean_error_of_the_episodes_that_reach_the_horizon(
@@ -142,3 +144,82 @@ def test_a_stronger_penalty_scores_worse(decays):
         for estimator in (LinearRegression(), Ridge(1e9))
     )
     assert scorer(free, decays) > scorer(stiff, decays)
+
+
+# -- crps_scorer --------------------------------------------------------------------------
+
+
+class Certain:
+    """What a forecaster predicts, with a std of its own."""
+
+    def __init__(self, model, std):
+        self.model, self.std = model, std
+
+    def predict(self, ds, *, return_std=False):
+        forecast = self.model.predict(ds)
+        if return_std:
+            forecast.std = np.where(np.isnan(forecast.mean), np.nan, self.std)
+        return forecast
+
+
+def test_crps_is_averaged_over_the_steps_of_an_episode_then_over_episodes(persistence, make_ramps):
+    model = persistence().fit(make_ramps([1.0], [10]))
+    test = make_ramps([1.0, 2.0, 9.0], [5, 4, 3])
+    sure = Certain(model, 0.0)  # the CRPS is the absolute error, slope * h / 10
+    assert_allclose(crps_scorer(4)(sure, test), -(4 / 10 + 8 / 10) / 2)
+    assert_allclose(crps_scorer(5)(sure, list(test)), -5 / 10)
+    assert_allclose(crps_scorer()(sure, test), -(1 * 3 + 2 * 2.5 + 9 * 2) / 10 / 3)
+    unsure = Certain(model, 3.0)
+    scores = crps(unsure.predict(test, return_std=True), test)
+    assert_allclose(crps_scorer()(unsure, test), -np.nanmean(scores, axis=(1, 2)).mean())
+    assert_allclose(crps_scorer(4)(unsure, test), -scores[:2, 3].mean())
+
+
+def test_crps_of_a_diverged_episode_is_error_score(persistence, make_ramps):
+    train, test = make_ramps([1.0], [10]), make_ramps([1.0, 1.0], [3, 2])
+    exploding = Certain(persistence(diverges_at=3).fit(train), 0.0)
+    assert_allclose(crps_scorer(error_score=-5)(exploding, test), (-5 - 0.15) / 2)
+    assert crps_scorer(3)(exploding, test) == -1e12
+    assert_allclose(crps_scorer(2)(exploding, test), -0.2)
+    assert np.isnan(crps_scorer(error_score=np.nan)(exploding, test))
+    assert crps_scorer(3, error_score=-0.1)(Certain(persistence().fit(train), 0.0), test) == -0.1
+
+
+def test_crps_prefers_the_right_std(decays, state_selector):
+    ds = decays.add_noise(0.3, of="std", random_state=0)
+    search = GridSearchCV(
+        TrajectoryRegressor(BayesianRidge(), random_state=0),
+        # priors: 1e9 insists on weights of 0, 1e5 on a large noise
+        {"estimator__lambda_1": [1e-6, 1e9], "estimator__alpha_2": [1e-6, 1e5]},
+        scoring=crps_scorer(),
+        cv=3,
+        error_score="raise",
+    ).fit(ds)
+    assert search.best_params_ == {"estimator__lambda_1": 1e-6, "estimator__alpha_2": 1e-6}
+    pipe = make_pipeline(state_selector(["s0"]), search.best_estimator_)
+    scores = cross_val_score(pipe, ds, scoring=crps_scorer(20), cv=3, error_score="raise")
+    assert (scores < 0).all()
+
+
+def test_crps_scorers_are_told_apart_and_refuse_what_they_cannot_score(persistence, make_ramps):
+    scorer = crps_scorer(20, error_score=-7)
+    assert repr(scorer) == "crps_scorer(20, error_score=-7)"
+    assert repr(crps_scorer()) == "crps_scorer()"
+    assert pickle.loads(pickle.dumps(scorer)) == scorer != crps_scorer(20)
+    assert crps_scorer(20) != horizon_scorer(20)
+    for arguments, message in [
+        ({"horizon": 0}, "at least 1"),
+        ({"horizon": [1, 2]}, "one number"),
+        ({"error_score": 1.0}, "must not exceed 0"),
+    ]:
+        with pytest.raises(ValueError, match=message):
+            crps_scorer(**arguments)
+    ds = make_ramps([1.0, 2.0], [4, 6])
+    model = Certain(persistence().fit(ds), 1.0)
+    with pytest.raises(ValueError, match=r"crps_scorer\(7\).*longest episode has 6 steps"):
+        crps_scorer(7)(model, ds)
+    with pytest.raises(ValueError, match="omit y"):
+        crps_scorer()(model, ds, np.zeros(2))
+    linear = TrajectoryRegressor(LinearRegression(), random_state=0).fit(ds)
+    with pytest.raises(ValueError, match="return_std"):
+        crps_scorer()(linear, ds)

@@ -87,6 +87,21 @@ def test_a_row_gets_the_same_bits_alone_in_a_batch_in_any_order(
         np.testing.assert_array_equal(predictor(x[i : i + 1]), together[:, i : i + 1])
 
 
+@pytest.mark.parametrize("widths", [(4, 250, 250, 4), (4, 17, 9, 1), (4, 11, 5), (4, 40, 6)])
+@pytest.mark.parametrize("n", [1, BLOCK, 300])
+def test_own_rows_of_each_member_get_the_bits_that_they_get_from_all_members(
+    widths: tuple[int, ...], n: int, threads: int
+) -> None:
+    predictor = make_predictor(widths, n_members=3)
+    x = np.stack([make_rows(n, seed) for seed in range(3)])
+    own = predictor.own(x)
+    assert own.shape == (3, n, widths[-1])
+    for e in range(3):
+        np.testing.assert_array_equal(own[e], predictor(x[e])[e])
+    order = np.random.default_rng(2).permutation(n)
+    np.testing.assert_array_equal(predictor.own(x[:, order]), own[:, order])
+
+
 def test_several_threads_give_the_same_bits_as_one() -> None:
     predictor, x = make_predictor((4, 600, 600, 3), n_members=3), make_rows(200)
     activation, seen = predictor._act, set()
@@ -161,6 +176,7 @@ def test_product_gives_a_pair_the_same_bits_alone() -> None:
 def test_no_rows_give_no_outputs() -> None:
     predictor = make_predictor()
     assert predictor(np.empty((0, 4))).shape == (2, 0, 3)
+    assert predictor.own(np.empty((2, 0, 4))).shape == (2, 0, 3)
     none = np.empty(0, dtype=np.intp)
     for n_left in (0, 5):
         left, right = np.ones((n_left, 3)), np.ones((n_left, 1))

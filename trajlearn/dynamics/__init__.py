@@ -6,6 +6,7 @@ from trajlearn.dynamics.baselines import (
     MeanEpisodeForecaster,
     ReferenceForecaster,
 )
+from trajlearn.dynamics.calibrated import CalibratedForecaster
 from trajlearn.dynamics.direct_reward import DirectRewardGP, DirectRewardNN
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.dynamics.lstm import LSTMRegressor
@@ -16,6 +17,7 @@ from trajlearn.dynamics.trajectory import TrajectoryRegressor
 
 __all__ = [
     "BlockScaler",
+    "CalibratedForecaster",
     "CurveForecaster",
     "DirectRewardGP",
     "DirectRewardNN",

@@ -5,13 +5,14 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, RegressorMixin, clone
+from sklearn.base import RegressorMixin, clone
 from sklearn.utils import Tags, check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
 from trajlearn._persistence import SaveMixin
 from trajlearn._sklearn import HasMethods, fit_context
 from trajlearn.dynamics._learner import Moments, fit_learner, mixture, moments_of, seeded
+from trajlearn.dynamics._nested_defaults import NestedDefaults
 from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.exceptions import InvalidEpisodeError
 from trajlearn.regressors._prediction import mean_of_members
@@ -22,11 +23,8 @@ __all__ = ["TwoDoorRegressor"]
 
 Floats = NDArray[np.float64]
 
-# parameters that None resolves to a default for
-_REPLACEABLE = ("estimator", "relabeler", "scaler")
 
-
-class TwoDoorRegressor(SaveMixin, RegressorMixin, BaseEstimator):
+class TwoDoorRegressor(SaveMixin, RegressorMixin, NestedDefaults):
     """Regressor of rows with targets, or of episodes that it relabels into them.
 
     A formulation says how rows are laid out, what its learner is to predict for a row, and what
@@ -75,48 +73,6 @@ class TwoDoorRegressor(SaveMixin, RegressorMixin, BaseEstimator):
         tags = super().__sklearn_tags__()
         tags.target_tags.multi_output = True
         return tags
-
-    def set_params(self, **params: Any) -> Self:
-        """Set parameters; nested names such as ``estimator__max_steps`` reach the defaults too.
-
-        Parameters
-        ----------
-        **params
-            By name.
-
-        Returns
-        -------
-        self
-        """
-        # first the estimator's own, which its defaults depend on
-        own = {key: value for key, value in params.items() if "__" not in key}
-        super().set_params(**own)
-        nested = {key: value for key, value in params.items() if key not in own}
-        replaceable = set(_REPLACEABLE) & set(self.get_params(deep=False))
-        for name in {key.partition("__")[0] for key in nested} & replaceable:
-            if getattr(self, name) is None:
-                setattr(self, name, self._defaults()[name])
-        return super().set_params(**nested)
-
-    def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """Get parameters.
-
-        Parameters
-        ----------
-        deep : bool, default=True
-            Also those of nested estimators, of the defaults too.
-
-        Returns
-        -------
-        dict
-        """
-        params = super().get_params(deep=deep)
-        if deep:
-            for name, default in self._defaults().items():
-                if name in params and params[name] is None:
-                    own = default.get_params()
-                    params |= {f"{name}__{key}": value for key, value in own.items()}
-        return params
 
     @fit_context(prefer_skip_nested_validation=True)
     def fit(

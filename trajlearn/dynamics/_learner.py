@@ -15,7 +15,12 @@ from trajlearn.regressors._prediction import mixture as mixture_of_members
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 
 Floats = NDArray[np.float64]
+# rows (n, k), or each member's own (E, n, k), to means (E, n, d) and variances, if it gives any
 Moments = Callable[[Floats], tuple[Floats, Floats | None]]
+# the same from a learner that is known to give variances
+FullMoments = Callable[[Floats], tuple[Floats, Floats]]
+# rows (m, k) and the member that each is for (m,), to means and variances (m, d)
+ByMember = Callable[[Floats, NDArray[np.intp]], tuple[Floats, Floats]]
 
 
 def seeded(estimator: Any, rng: np.random.Generator) -> Any:
@@ -87,6 +92,46 @@ def moments_of(learner: Any) -> Moments:
             mean, std = learner.predict(rows, return_std=True)
             return _by_target(mean, len(rows)), _by_target(std, len(rows)) ** 2
         return _by_target(learner.predict(rows), len(rows)), None
+
+    return moments
+
+
+def n_members_of(learner: Any) -> int:
+    """E of a fitted learner: 1 of all but an ensemble of networks."""
+    return len(learner.coefs_[0]) if isinstance(learner, MLPEnsembleRegressor) else 1
+
+
+def own_moments_of(learner: Any) -> Moments:
+    """Function from scaled rows of each member's own (E, n, k) to means and variances (E, n, d)."""
+    if isinstance(learner, MLPEnsembleRegressor):
+        predictor = learner.predictor()
+        return lambda rows: learner.moments(predictor.own(rows))
+    moments = moments_of(learner)
+    return lambda rows: moments(rows[0])
+
+
+def by_member(own: FullMoments, n_members: int) -> ByMember:
+    """Evaluate each row by the one member that it is for.
+
+    Parameters
+    ----------
+    own : callable
+        From rows (E, n, k), each member's own, to means and variances (E, n, d).
+    n_members : int
+        E.
+    """
+
+    def moments(rows: Floats, member: NDArray[np.intp]) -> tuple[Floats, Floats]:
+        order = np.argsort(member, kind="stable")
+        counts = np.bincount(member, minlength=n_members)
+        # place of each row in the queue of its member
+        place = np.empty_like(order)
+        place[order] = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        # the rest of a shorter queue is filled with a row that is possible
+        queues = np.tile(rows[0], (n_members, counts.max(), 1))
+        queues[member, place] = rows
+        means, variances = own(queues)
+        return means[member, place], variances[member, place]
 
     return moments
 

@@ -14,7 +14,14 @@ from trajlearn.dynamics._dynamics import DynamicsEstimator
 from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES, Prediction, Request
 from trajlearn.dynamics._learner import spread
 from trajlearn.dynamics._query import Query
-from trajlearn.dynamics._rollout import InputRows, Limits, Step, roll_out
+from trajlearn.dynamics._rollout import (
+    InputRows,
+    Limits,
+    Step,
+    checked_actions,
+    filled,
+    roll_out,
+)
 from trajlearn.dynamics.baselines import ReferenceForecaster
 from trajlearn.exceptions import MissingFieldError, MixedSamplingError
 from trajlearn.trajectories import TrajectoryDataset
@@ -81,7 +88,7 @@ class RollingEstimator(DynamicsEstimator):
     def _restore(self, rows: Floats, means: Floats, variances: Floats) -> tuple[Floats, Floats]:
         means = means * self.target_scale_
         if self.target == "change":
-            means = means + rows[:, self.layout_["state"]]
+            means = means + rows[..., self.layout_["state"]]
         return means, variances * self.target_scale_**2
 
     # -- fitting --------------------------------------------------------------------------
@@ -170,21 +177,23 @@ class RollingEstimator(DynamicsEstimator):
     def _forecast_states(self, query: Query, request: Request) -> Prediction:
         source, policy = self._source(query.ds, request.actions, request.policy)
         self._check_time_step(query.ds)
+        prediction = self._rolled_out(query, request, self._input_rows(query, source, policy))
+        prediction.actions = source
+        return prediction
 
-        def rolled_out(copies: int, rng: np.random.Generator | None) -> Floats:
-            return roll_out(
-                np.tile(query.initial_states, (copies, 1)),
-                query.n_steps,
-                self._input_rows(query, source, policy, copies=copies),
-                self._step(query, copies, rng),
-                self._limits(),
-            )
+    def _rolled_out(self, query: Query, request: Request, inputs: InputRows) -> Prediction:
+        """Mean by one roll-out of the mean, everything else by particles."""
 
-        prediction = Prediction(rolled_out(1, None), actions=source)
+        def paths_of(copies: int, rng: np.random.Generator | None) -> Floats:
+            initial = np.tile(query.initial_states, (copies, 1))
+            step = self._step(query, copies, rng)
+            return roll_out(initial, query.n_steps, inputs, step, self._limits())
+
+        prediction = Prediction(paths_of(1, None))
         n_paths = max(request.n_samples or 0, self.n_particles if request.return_std else 0)
         if not n_paths:
             return prediction
-        paths = rolled_out(n_paths, request.rng).reshape(n_paths, *prediction.mean.shape)
+        paths = paths_of(n_paths, request.rng).reshape(n_paths, *prediction.mean.shape)
         if request.return_std:
             with np.errstate(invalid="ignore"):
                 std = paths.std(axis=0)
@@ -203,8 +212,11 @@ class RollingEstimator(DynamicsEstimator):
         width = np.ptp(self.state_range_, axis=0)
         return Limits(clip, centre, DIVERGENCE_RANGES * np.where(width > 0, width, 1.0))
 
-    def _input_rows(self, query: Query, source: str, policy: Any, *, copies: int) -> InputRows:
-        """Rows of inputs at each step of a roll-out; only known signals and actions enter."""
+    def _input_rows(self, query: Query, source: str, policy: Any) -> InputRows:
+        """Rows of inputs at each step of a roll-out; only known signals and actions enter.
+
+        For any number of copies of the starts: copy i of start j is row ``i * len(query) + j``.
+        """
         ds = query.ds
         blocks: dict[str, Floats] = {}
         if "params" in self.layout_ or source == "policy":
@@ -220,11 +232,10 @@ class RollingEstimator(DynamicsEstimator):
             assert ds.actions is not None  # _source has checked
             logged = query.future(ds.actions, steps=True)
         times = np.concatenate([query.initial_times[:, None], query.times], axis=1)
-        times = _filled(times)
-        previous = np.empty(0)
+        times = filled(times)
 
-        def inputs(states: Floats, k: int) -> Floats:
-            nonlocal previous
+        def inputs(states: Floats, k: int, previous: Floats | None) -> tuple[Floats, Floats | None]:
+            copies = len(states) // len(query)
             now: dict[str, Floats] = {"state": states}
             if logged is not None:
                 blocks["action"] = logged[:, k]
@@ -233,7 +244,7 @@ class RollingEstimator(DynamicsEstimator):
                 # the controller knows the state itself, not what it is relative to
                 base = 0.0 if query.base is None else np.tile(query.base[:, k], (copies, 1))
                 actions = policy(states + base, by_copy, np.tile(times[:, k], copies))
-                now["action"] = _checked_actions(actions, self.layout_["action"], states)
+                now["action"] = checked_actions(actions, self.layout_["action"], states)
             if "params" in self.layout_:
                 blocks["params"] = theta[:, k]
             if "dt" in self.layout_:
@@ -245,9 +256,9 @@ class RollingEstimator(DynamicsEstimator):
             for block, values in blocks.items():
                 now[block] = values if copies == 1 else np.tile(values, (copies, 1))
             if "previous" in self.layout_:
-                now["previous"] = self._before(query, now["action"]) if k == 0 else previous
-                previous = now["action"]
-            return self.layout_.assemble(now)
+                before = self._before(query, now["action"]) if previous is None else previous
+                now["previous"] = before
+            return self.layout_.assemble(now), now.get("action")
 
         return inputs
 
@@ -285,22 +296,3 @@ class RollingEstimator(DynamicsEstimator):
                 "TrajectoryRegressor predicts any."
             )
         return np.arange(1, steps[-1] + 1) * dt, steps - 1
-
-
-def _filled(times: Floats) -> Floats:
-    """Replace the padding at the end of a row by its last time."""
-    known = np.where(np.isfinite(times), np.arange(times.shape[1]), 0)
-    return np.take_along_axis(times, np.maximum.accumulate(known, axis=1), axis=1)
-
-
-def _checked_actions(actions: Any, block: slice, states: Floats) -> Floats:
-    actions = np.asarray(actions, dtype=np.float64)
-    want = (len(states), block.stop - block.start)
-    if actions.shape != want:
-        raise ValueError(
-            f"the policy returned actions of shape {actions.shape} for {len(states)} states; "
-            f"expected {want}."
-        )
-    if not np.isfinite(actions).all():
-        raise ValueError("the policy returned NaN or infinite actions for finite states.")
-    return actions

@@ -2,16 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from trajlearn.dynamics._learner import Moments
-from trajlearn.regressors._prediction import mean_of_members
-
 Floats = NDArray[np.float64]
-# rows of inputs for the states at a step: (states (m, d_s), step) -> (m, n_features)
-InputRows = Callable[[Floats, int], Floats]
+# (states (m, d_s), step, actions before (m, d_a) or None where nobody knows them yet)
+# -> rows of inputs (m, n_features), and the actions among them or None
+InputRows = Callable[[Floats, int, Floats | None], tuple[Floats, Floats | None]]
 # states after a step: (rows (m, n_features), step) -> (m, d_s)
 Step = Callable[[Floats, int], Floats]
 
@@ -25,12 +24,15 @@ class Limits:
     reach: Floats
 
     def apply(self, states: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-        """Clipped states, and which rows have diverged."""
-        if self.clip is not None:
-            states = np.clip(states, *self.clip)
+        """Clipped states (..., d_s), and which of them have diverged (...)."""
+        states = self.clipped(states)
         with np.errstate(invalid="ignore"):
             off = ~(np.abs(states - self.centre) <= self.reach)
-        return states, np.any(off, axis=1)
+        return states, np.any(off, axis=-1)
+
+    def clipped(self, states: Floats) -> Floats:
+        """States (..., d_s), clipped if that is asked for."""
+        return states if self.clip is None else np.clip(states, *self.clip)
 
 
 def roll_out(
@@ -47,7 +49,8 @@ def roll_out(
     initial_states : ndarray of shape (m, d_s)
     n_steps : int
     inputs : callable
-        Rows of the learner's inputs from states and the number of the step.
+        Rows of the learner's inputs, and actions, from states, the number of the step and the
+        actions before.
     step : callable
         ``step(rows, k) -> states`` after step k.
     limits : Limits
@@ -61,9 +64,11 @@ def roll_out(
     states = initial_states
     path = np.empty((len(states), n_steps, states.shape[1]))
     gone = np.zeros(len(states), dtype=bool)
+    actions = None
     for k in range(n_steps):
+        rows, actions = inputs(states, k, actions)
         with np.errstate(over="ignore", invalid="ignore"):
-            states, off = limits.apply(step(inputs(states, k), k))
+            states, off = limits.apply(step(rows, k))
         gone |= off
         path[:, k] = states
         if gone.any():
@@ -72,31 +77,27 @@ def roll_out(
     return path
 
 
-def expected_step(moments: Moments) -> Step:
-    """Mean over members at every step."""
-    return lambda rows, k: mean_of_members(moments(rows)[0])
+def filled(times: Floats) -> Floats:
+    """Replace the padding at the end of a row by its last time."""
+    known = np.where(np.isfinite(times), np.arange(times.shape[1]), 0)
+    return np.take_along_axis(times, np.maximum.accumulate(known, axis=1), axis=1)
 
 
-def sampled_step(
-    moments: Callable[[Floats], tuple[Floats, Floats]],
-    member: NDArray[np.intp] | None,
-    rng: np.random.Generator,
-) -> Step:
-    """One member a particle, with its noise: fixed (TSinf), or drawn anew at every step (TS1).
+def checked_actions(actions: Any, block: slice, states: Floats) -> Floats:
+    """Actions (m, d_a) that a policy returned.
 
-    Parameters
-    ----------
-    moments : callable
-    member : ndarray of shape (m,) or None
-        Member of each particle; None draws one at every step.
-    rng : Generator
+    Raises
+    ------
+    ValueError
+        If they are not one finite action a state, as wide as the block.
     """
-
-    def step(rows: Floats, k: int) -> Floats:
-        means, variances = moments(rows)
-        which = rng.integers(len(means), size=len(rows)) if member is None else member
-        particle = np.arange(len(rows))
-        noise = rng.standard_normal(means.shape[1:])
-        return means[which, particle] + np.sqrt(variances[which, particle]) * noise
-
-    return step
+    actions = np.asarray(actions, dtype=np.float64)
+    want = (len(states), block.stop - block.start)
+    if actions.shape != want:
+        raise ValueError(
+            f"the policy returned actions of shape {actions.shape} for {len(states)} states; "
+            f"expected {want}."
+        )
+    if not np.isfinite(actions).all():
+        raise ValueError("the policy returned NaN or infinite actions for finite states.")
+    return actions

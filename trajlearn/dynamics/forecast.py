@@ -7,16 +7,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
+from trajlearn.dynamics._conformal import half_widths
+from trajlearn.dynamics._shared_states import shared_states
 from trajlearn.trajectories import TrajectoryDataset
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Forecast"]
+__all__ = ["Forecast", "shared_states"]
 
 Floats = NDArray[np.float64]
 
 _PER_FORECAST = ("times", "lengths", "initial_states", "initial_times", "start", "diverged_at")
+# the same, None where there is none
+_PERHAPS = ("std", "raw_std", "episode", "bands")
 
 
 class Forecast:
@@ -57,6 +61,11 @@ class Forecast:
     episode : ndarray of shape (n,) or None, default=None
         Episode of each forecast, where episodes have several starts; otherwise forecast i
         belongs to episode i.
+    bands : ndarray of shape (n,) of ConformalBands or None, default=None
+        Calibration of each forecast, of which `interval` takes its widths
+        (`CalibratedForecaster`); forecasts of one calibration share it. Needs `raw_std`.
+    raw_std : ndarray of shape (n, H, d_s) or None, default=None
+        Standard deviation before calibration, which `bands` multiply.
 
     Examples
     --------
@@ -89,8 +98,11 @@ class Forecast:
         std: Floats | None = None,
         samples: Floats | None = None,
         episode: NDArray[np.intp] | None = None,
+        bands: NDArray[np.object_] | None = None,
+        raw_std: Floats | None = None,
     ) -> None:
         self.mean, self.std, self.samples = mean, std, samples
+        self.bands, self.raw_std = bands, raw_std
         self.times, self.horizons, self.lengths = times, horizons, lengths
         self.initial_states, self.initial_times = initial_states, initial_times
         self.start, self.episode, self.diverged_at = start, episode, diverged_at
@@ -123,11 +135,12 @@ class Forecast:
             key = key[0]
         index = np.atleast_1d(np.arange(len(self))[key])
         chosen: dict[str, Any] = {name: getattr(self, name)[index] for name in _PER_FORECAST}
+        for name in _PERHAPS:
+            value = getattr(self, name)
+            chosen[name] = None if value is None else value[index]
         return self._replace(
             mean=self.mean[index],
-            std=None if self.std is None else self.std[index],
             samples=None if self.samples is None else self.samples[:, index],
-            episode=None if self.episode is None else self.episode[index],
             **chosen,
         )
 
@@ -140,6 +153,8 @@ class Forecast:
             parts.append("std")
         if self.samples is not None:
             parts.append(f"samples={len(self.samples)}")
+        if self.bands is not None:
+            parts.append("bands")
         if self.actions != "none":
             parts.append(f"actions={self.actions!r}")
         if self.diverged_at.any():
@@ -183,6 +198,7 @@ class Forecast:
         return self._replace(
             mean=self.mean[:, columns],
             std=None if self.std is None else self.std[:, columns],
+            raw_std=None if self.raw_std is None else self.raw_std[:, columns],
             samples=None if self.samples is None else self.samples[:, :, columns],
             times=self.times[:, columns],
             horizons=self.horizons[columns],
@@ -201,7 +217,13 @@ class Forecast:
         Returns
         -------
         lower, upper : ndarray of shape (n, H, d_s)
-            Quantiles of the samples if there are some, else Gaussian.
+            Of the conformal bands if there are some; else quantiles of the samples, if there
+            are some; else Gaussian.
+
+        Warns
+        -----
+        CalibrationWarning
+            If too few episodes were calibrated on for bands of this level, which are infinite.
 
         Raises
         ------
@@ -210,10 +232,21 @@ class Forecast:
         """
         if not 0 < level < 1:
             raise ValueError(f"level = {level} must lie between 0 and 1.")
+        if self.bands is not None and self.raw_std is not None:
+            width = half_widths(self.bands, level, self.raw_std, self.horizons, self.lengths)
+            with np.errstate(invalid="ignore"):
+                return self.mean - width, self.mean + width
         if self.samples is not None:
             tail = (1 - level) / 2
-            lower, upper = np.quantile(self.samples, [tail, 1 - tail], axis=0)
-            return lower, upper
+            # of S + 1 slots between S samples a truth of the same kind is in each equally often
+            with np.errstate(invalid="ignore"):
+                lower, upper = np.quantile(self.samples, [tail, 1 - tail], axis=0, method="weibull")
+            # between two samples that have diverged nothing can be interpolated
+            gone = np.isinf(self.samples).any(axis=0)
+            return (
+                np.where(gone & np.isnan(lower), -np.inf, lower),
+                np.where(gone & np.isnan(upper), np.inf, upper),
+            )
         if self.std is None:
             raise ValueError(
                 "the forecast has no uncertainty: ask for return_std=True or n_samples=."
@@ -221,8 +254,8 @@ class Forecast:
         width = NormalDist().inv_cdf(0.5 + level / 2) * self.std
         return self.mean - width, self.mean + width
 
-    def squared_errors(self, truth: TrajectoryDataset) -> Floats:
-        """Squared error of each state in units of its training range (n, H, d_s).
+    def residuals(self, truth: TrajectoryDataset) -> Floats:
+        """Logged states minus predicted ones (n, H, d_s), in their own units.
 
         NaN where `truth` or the forecast has no such step; +inf from the divergence on. A
         dataset whose states are a transformer's estimates is compared by its `observed`, the
@@ -257,16 +290,37 @@ class Forecast:
         known = steps <= truth.lengths[episode][:, None]
         known &= np.arange(len(self.horizons)) < self.lengths[:, None]
         rows = truth.offsets[:-1][episode][:, None] + np.where(known, steps, 0)
-        low, high = self.state_range[:, columns]
-        width = np.where(high > low, high - low, 1.0)
-        with np.errstate(over="ignore", invalid="ignore"):
-            squared = ((self.mean[..., columns] - logged[rows]) / width) ** 2
+        residuals = logged[rows] - self.mean[..., columns]
         diverged = (self.diverged_at > 0)[:, None] & (
             np.arange(1, len(self.horizons) + 1) >= self.diverged_at[:, None]
         )
-        squared[diverged] = np.inf
-        squared[~known] = np.nan
-        return squared
+        residuals[diverged] = np.inf
+        residuals[~known] = np.nan
+        return residuals
+
+    def squared_errors(self, truth: TrajectoryDataset) -> Floats:
+        """Squared error of each state in units of its training range (n, H, d_s).
+
+        Parameters
+        ----------
+        truth : TrajectoryDataset
+            As in `residuals`.
+
+        Returns
+        -------
+        ndarray of shape (n, H, d_s)
+            NaN where there is nothing to compare with; +inf from the divergence on.
+
+        Raises
+        ------
+        ValueError
+            As in `residuals`.
+        """
+        residuals = self.residuals(truth)
+        columns, _, _ = shared_states(self.state_names, truth)
+        low, high = self.state_range[:, columns]
+        with np.errstate(over="ignore"):
+            return (residuals / np.where(high > low, high - low, 1.0)) ** 2
 
     def to_dataset(self) -> TrajectoryDataset:
         """Mean trajectories as episodes, the initial state first; cut where they diverge.
@@ -324,43 +378,6 @@ class Forecast:
         return pd.DataFrame(columns)[kept].reset_index(drop=True)
 
 
-def shared_states(
-    names: Sequence[str], truth: TrajectoryDataset
-) -> tuple[NDArray[np.intp], tuple[str, ...], Floats]:
-    """Which of the forecast states `names` were logged, and the logged values.
-
-    Returns
-    -------
-    columns : ndarray of shape (k,)
-        Positions in `names`.
-    shared : tuple of str
-        Names in `truth`.
-    logged : ndarray of shape (sum of T + 1, k)
-
-    Raises
-    ------
-    ValueError
-        If the forecast and the episodes are of different states.
-    """
-    logged, known = truth.states, truth.state_names
-    if truth.observed is not None:
-        logged, known = truth.observed, truth.observed_names
-    every = np.arange(len(names), dtype=np.intp)
-    if tuple(names) == known:
-        return every, known, logged
-    shared = tuple(name for name in names if name in known)
-    derived = [name for name in names if name not in known and not name.startswith("d_")]
-    if shared and (not derived or len(shared) == len(known)):
-        index = [known.index(name) for name in shared]
-        return every[np.isin(names, shared)], shared, logged[:, index]
-    if not shared and len(names) == len(known):
-        return every, known, logged
-    raise ValueError(
-        f"the forecast has {len(names)} states ({', '.join(names)}), the episodes {len(known)} "
-        f"({', '.join(known)}): give the episodes that were forecast, with the same names."
-    )
-
-
 def _without_forecasts(value: Any) -> Any:
     """Replace forecasts by their means, also inside lists and tuples."""
     if isinstance(value, (list, tuple)):
@@ -400,13 +417,16 @@ def concatenate(forecasts: Sequence[Forecast]) -> Forecast:
         for name in _PER_FORECAST
         if name != "times"
     }
+    bands = [f.bands for f in forecasts if f.bands is not None]
     low = np.min([f.state_range[0] for f in forecasts], axis=0)
     high = np.max([f.state_range[1] for f in forecasts], axis=0)
     return longest._replace(
         mean=joined("mean"),
         std=joined("std"),
+        raw_std=joined("raw_std"),
         samples=joined("samples", axis=1),
         times=joined("times"),
         state_range=np.stack([low, high]),
+        bands=np.concatenate(bands) if len(bands) == len(forecasts) else None,
         **rest,
     )

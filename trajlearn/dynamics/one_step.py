@@ -6,10 +6,23 @@ from typing import Any, ClassVar
 import numpy as np
 
 from trajlearn._sklearn import StrOptions
-from trajlearn.dynamics._learner import required
+from trajlearn.dynamics._forecaster import Prediction, Request
+from trajlearn.dynamics._learner import (
+    FullMoments,
+    Moments,
+    by_member,
+    n_members_of,
+    own_moments_of,
+    required,
+)
+from trajlearn.dynamics._propagation_gaussians import TransitionStep, roll_gaussians
+from trajlearn.dynamics._propagation_gp import gp_moments, has_exact_moments
+from trajlearn.dynamics._propagation_particles import drawn_step, expected_step, member_step
+from trajlearn.dynamics._propagation_steps import Image, linearised, mean_only, unscented
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics._rolling import RollingEstimator
-from trajlearn.dynamics._rollout import Floats, Step, expected_step, sampled_step
+from trajlearn.dynamics._rollout import Floats, InputRows, Step
+from trajlearn.dynamics.propagation import BY_GAUSSIANS, PROPAGATIONS
 from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 from trajlearn.trajectories import TransitionRelabeler
@@ -24,8 +37,9 @@ class OneStepRegressor(RollingEstimator):
     recompute them from the predicted states; with ``inputs="params"`` it needs neither. D, P, DE
     and PE of the paper are the choices ``n_members`` and ``probabilistic`` of the learner.
 
-    The mean of a forecast averages the members at every step. Standard deviations and samples
-    come from particles that carry the members' differences and noise along (see `propagation`).
+    `propagation` says how the members' differences and noise are carried along; it is read when
+    a forecast is made, so that ``set_params(propagation=...)`` changes the next one. See
+    `trajlearn.dynamics.propagation` for what each keeps and costs.
 
     Parameters
     ----------
@@ -51,11 +65,14 @@ class OneStepRegressor(RollingEstimator):
         "auto": the policy if there is one, else the logged actions.
     clip_states : float or None, default=None
         Clip predicted states to this multiple of the training range about its centre.
-    propagation : {"tsinf", "ts1", "expectation"}, default="tsinf"
-        Particles keep one member ("tsinf") or draw one at every step ("ts1"). "expectation":
-        members are averaged at every step, and there is no uncertainty to ask for.
+    propagation : {"tsinf", "ts1", "expectation", "moment", "unscented"}, default="tsinf"
+        Particles that keep one member ("tsinf"), draw one at every step ("ts1"), or draw from
+        one Gaussian with the mean and total variance of all members ("expectation"); the mean of
+        the forecast then averages the members at every step. Or a Gaussian for each member, by
+        the slopes of the step ("moment"; exact for a `GPRegressor` with the RBF kernel) or by
+        sigma points ("unscented"); the mean is then the mean of what is propagated.
     n_particles : int, default=50
-        Particles behind a standard deviation.
+        Particles behind a standard deviation; "moment" and "unscented" need none.
     error_score : float, default=-1e12
         Score of an episode whose forecast diverged.
     random_state : int, RandomState or None, default=None
@@ -69,6 +86,8 @@ class OneStepRegressor(RollingEstimator):
         Time step of the training episodes; None where it is an input or unknown (rows).
     state_range_ : ndarray of shape (2, d_s)
         Least and greatest training states.
+    action_range_ : ndarray of shape (2, d_a)
+        The same of the actions, where the action before is among the inputs.
     baseline_ : forecaster or None
     n_features_in_ : int
 
@@ -80,6 +99,8 @@ class OneStepRegressor(RollingEstimator):
     ----------
     K. Chua et al., "Deep Reinforcement Learning in a Handful of Trials using Probabilistic
     Dynamics Models", NeurIPS 2018 (TS1, TSinf).
+    M. P. Deisenroth and C. E. Rasmussen, "PILCO: A Model-Based and Data-Efficient Approach to
+    Policy Search", ICML 2011 ("moment" with a GP).
 
     Examples
     --------
@@ -100,7 +121,7 @@ class OneStepRegressor(RollingEstimator):
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **RollingEstimator._parameter_constraints,
-        "propagation": [StrOptions({"tsinf", "ts1", "expectation"})],
+        "propagation": [StrOptions(set(PROPAGATIONS))],
     }
 
     def __init__(
@@ -141,24 +162,97 @@ class OneStepRegressor(RollingEstimator):
             "scaler": BlockScaler(),
         }
 
+    def _fit_rows(self, rows: Floats, targets: Floats, weight: Floats | None, groups: Any) -> None:
+        if "previous" in self.layout_:
+            actions = rows[:, self.layout_["action"]]
+            self.action_range_ = np.stack([actions.min(axis=0), actions.max(axis=0)])
+        super()._fit_rows(rows, targets, weight, groups)
+
     # -- forecasting ----------------------------------------------------------------------
 
     def _step(self, query: Query, copies: int, rng: np.random.Generator | None) -> Step:
-        moments = self._moments()
         if rng is None:
-            return expected_step(moments)
+            return expected_step(self._moments())
         if self.propagation == "expectation":
-            raise ValueError(
-                'propagation="expectation" carries no uncertainty: choose "tsinf" or "ts1" for '
-                "return_std= or n_samples=."
-            )
+            return drawn_step(self._full(self._moments()), rng)
+        n_members = n_members_of(self.estimator_)
+        moments = by_member(self._full(self._own_moments()), n_members)
+        if self.propagation == "ts1":
+            return member_step(moments, n_members, rng)
+        member = np.repeat(rng.permutation(np.arange(copies) % n_members), len(query))
+        return member_step(moments, member, rng)
 
-        def spread(rows: Floats) -> tuple[Floats, Floats]:
+    def _own_moments(self) -> Moments:
+        """Function from raw rows of each member's own (E, n, k) to means and variances."""
+        learner = own_moments_of(self.estimator_)
+
+        def moments(rows: Floats) -> tuple[Floats, Floats | None]:
+            scaled = self._scaled(rows.reshape(-1, rows.shape[-1]))
+            means, variances = learner(scaled.reshape(*rows.shape[:2], -1))
+            known = np.zeros_like(means) if variances is None else variances
+            means, known = self._restore(rows, means, known)
+            return means, None if variances is None else known
+
+        return moments
+
+    def _full(self, moments: Moments, *, needed: bool = True) -> FullMoments:
+        """The same with variances, which are zero where there are none and none is `needed`."""
+
+        def full(rows: Floats) -> tuple[Floats, Floats]:
             means, variances = moments(rows)
+            if variances is None and not needed:
+                return means, np.zeros_like(means)
             return means, required(variances, self.estimator_)
 
-        member = None
-        n_members = getattr(self.estimator_, "n_members", 1)
-        if self.propagation == "tsinf":
-            member = np.repeat(rng.permutation(np.arange(copies) % n_members), len(query))
-        return sampled_step(spread, member, rng)
+        return full
+
+    def _rolled_out(self, query: Query, request: Request, inputs: InputRows) -> Prediction:
+        if self.propagation not in PROPAGATIONS:
+            # fit has checked it, but it may have been set since
+            raise ValueError(
+                f"propagation = {self.propagation!r}; choose one of {sorted(PROPAGATIONS)}."
+            )
+        if self.propagation not in BY_GAUSSIANS:
+            return super()._rolled_out(query, request, inputs)
+        initial, n_samples = query.initial_states, request.n_samples or 0
+        uncertain = request.return_std or bool(n_samples)
+        if "previous" in self.layout_:
+            # what stands for an action before the start is not read
+            before = np.zeros((len(query), len(self.layout_.columns["previous"])))
+            initial = np.concatenate([initial, before], axis=1)
+        rolled = roll_gaussians(
+            initial,
+            query.n_steps,
+            n_members_of(self.estimator_),
+            self._transition(inputs, uncertain=uncertain),
+            self._limits(),
+            n_samples=n_samples,
+            rng=request.rng,
+        )
+        std = rolled.std if request.return_std else None
+        return Prediction(rolled.mean, std, rolled.samples)
+
+    def _transition(self, inputs: InputRows, *, uncertain: bool) -> TransitionStep:
+        """Step of the members' Gaussians."""
+        moments = self._full(self._own_moments(), needed=uncertain)
+        image = Image(inputs, moments, self._limits(), carries="previous" in self.layout_)
+        width = self._widths()
+        if self.propagation == "unscented":
+            return unscented(image, len(width))
+        if has_exact_moments(self.estimator_):
+            return gp_moments(
+                self.estimator_,
+                image,
+                self._scaled,
+                width,
+                target_scale=self.target_scale_,
+                change=self.target == "change",
+            )
+        return linearised(image, width) if uncertain else mean_only(image)
+
+    def _widths(self) -> Floats:
+        """Training range of each number of a point: state, and action before if it is an input."""
+        width = np.ptp(self.rolled_range_, axis=0)
+        if "previous" in self.layout_:
+            width = np.concatenate([width, np.ptp(self.action_range_, axis=0)])
+        return np.where(width > 0, width, 1.0)

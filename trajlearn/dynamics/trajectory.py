@@ -1,5 +1,6 @@
 """Trajectory-based models: the state after a horizon in one evaluation."""
 
+from functools import partial
 from numbers import Real
 from typing import Any, ClassVar
 
@@ -56,7 +57,8 @@ class TrajectoryRegressor(DynamicsEstimator):
     Parameters
     ----------
     estimator : regressor or None, default=None
-        Any scikit-learn regressor; None: `MLPEnsembleRegressor`.
+        Any scikit-learn regressor; None: ``MLPEnsembleRegressor(probabilistic="separate")``,
+        whose variance is that of training residuals, hence too small with few episodes: calibrate.
     relabeler : SubtrajectoryRelabeler or None, default=None
         None: ``SubtrajectoryRelabeler(starts="early", horizons="mixture", n_knots=3)``.
     scaler : transformer or None, default=None
@@ -96,6 +98,7 @@ class TrajectoryRegressor(DynamicsEstimator):
     See Also
     --------
     OneStepRegressor : models of one step, rolled out.
+    CalibratedForecaster : intervals that hold on new episodes.
 
     References
     ----------
@@ -147,7 +150,7 @@ class TrajectoryRegressor(DynamicsEstimator):
 
     def _defaults(self) -> dict[str, Any]:
         return {
-            "estimator": MLPEnsembleRegressor(),
+            "estimator": MLPEnsembleRegressor(probabilistic="separate"),
             "relabeler": SubtrajectoryRelabeler(starts="early", horizons="mixture", n_knots=3),
             "scaler": BlockScaler(horizon=HorizonFeatures(), phase=PhaseFeatures()),
         }
@@ -287,9 +290,10 @@ class TrajectoryRegressor(DynamicsEstimator):
         return "references" in self.layout_
 
     def _forecast_states(self, query: Query, request: Request) -> Prediction:
-        means, variances = self._at(query)
+        spread = bool(request.return_std or request.n_samples)
+        means, variances = self._at(query, means_only=not spread)
         prediction = Prediction(mean_of_members(means))
-        if request.return_std or request.n_samples:
+        if spread:
             variances = required(variances, self.estimator_)
             std = np.sqrt(mixture(means, variances, self.estimator_)[1])
             prediction.std = std if request.return_std else None
@@ -299,8 +303,11 @@ class TrajectoryRegressor(DynamicsEstimator):
             )
         return prediction
 
-    def _at(self, query: Query) -> tuple[Floats, Floats | None]:
-        """Means and variances (E, n, H, d_s) at every step of a query."""
+    def _at(self, query: Query, *, means_only: bool = False) -> tuple[Floats, Floats | None]:
+        """Means and variances (E, n, H, d_s) at every step of a query.
+
+        `means_only` saves the variances where they take a network of their own.
+        """
         horizons = np.where(query.known(), query.horizons, 0.0)
         n, n_steps = horizons.shape
         longest = horizons[np.argmax(query.lengths)]
@@ -310,8 +317,8 @@ class TrajectoryRegressor(DynamicsEstimator):
             and not {"references", "phase"} & set(self.layout_)
         )
         if splits and ((horizons == longest) | ~query.known()).all():
-            return self._at_split_rows(query, np.arange(n), longest[None])
-        at_some = self._at_split_rows if splits else self._at_rows
+            return self._at_split_rows(query, np.arange(n), longest[None], means_only)
+        at_some = partial(self._at_split_rows, means_only=means_only) if splits else self._at_rows
         per_chunk = max(_CHUNK_ROWS // n_steps, 1)
         means, variances = [], []
         for at in range(0, n, per_chunk):
@@ -348,8 +355,8 @@ class TrajectoryRegressor(DynamicsEstimator):
         return means.reshape(shape), None if variances is None else variances.reshape(shape)
 
     def _at_split_rows(
-        self, query: Query, some: NDArray[np.intp], horizons: Floats
-    ) -> tuple[Floats, Floats]:
+        self, query: Query, some: NDArray[np.intp], horizons: Floats, means_only: bool
+    ) -> tuple[Floats, Floats | None]:
         """Some starts at horizons (len(some), H), or (1, H) for all: the first layer is split.
 
         Its products with starts and with horizons are computed apart. So also where horizons
@@ -363,20 +370,21 @@ class TrajectoryRegressor(DynamicsEstimator):
         which = np.arange(horizons.size).reshape(horizons.shape)
         columns = self.scaler_.block_columns_["horizon"]
         others = np.setdiff1d(np.arange(self.estimator_.n_features_in_), columns)
-        outputs = self.estimator_.predictor().product(
+        outputs = self.estimator_.predictor(means_only=means_only).product(
             self._scaled(left)[:, others],
             self._scaled(right)[:, columns],
             (others, columns),
             (np.repeat(np.arange(len(some)), shape[1]), np.broadcast_to(which, shape).ravel()),
         )
-        means, variances = (
-            part.reshape(len(part), *shape, -1) for part in self.estimator_.moments(outputs)
-        )
+        full = (len(outputs), *shape, len(self.target_scale_))
         gate = self._gate(right) if self._gated else np.ones((len(right), 1))
         gate = gate.reshape(*horizons.shape, 1)
         scale = gate * self.target_scale_
         anchor = self._anchor(query.initial_states[some, None], gate)
-        return anchor + scale * means, scale**2 * variances
+        if means_only:
+            return anchor + scale * outputs[..., : full[-1]].reshape(full), None
+        means, variances = self.estimator_.moments(outputs)
+        return anchor + scale * means.reshape(full), scale**2 * variances.reshape(full)
 
     def _looked_at(self, grid: Floats, chosen: NDArray[np.intp]) -> tuple[Floats, NDArray[np.intp]]:
         n_knots = getattr(self.relabeler_, "n_knots", 0)

@@ -6,8 +6,18 @@ is given, or makes a figure, and returns the axes, so that titles, limits and le
 changed afterwards.
 """
 
+from trajlearn.plotting.calibration import plot_coverage, plot_pit, plot_reliability
 from trajlearn.plotting.errors import plot_horizon_errors
+from trajlearn.plotting.fan import plot_fan
 from trajlearn.plotting.forecasts import plot_forecast
 from trajlearn.plotting.rewards import plot_reward_table
 
-__all__ = ["plot_forecast", "plot_horizon_errors", "plot_reward_table"]
+__all__ = [
+    "plot_coverage",
+    "plot_fan",
+    "plot_forecast",
+    "plot_horizon_errors",
+    "plot_pit",
+    "plot_reliability",
+    "plot_reward_table",
+]

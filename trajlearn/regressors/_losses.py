@@ -1,6 +1,6 @@
 """Losses of an ensemble's outputs and their gradients, written out.
 
-Both are a sum over members of a mean over rows and targets, so that a member learns as it would
+All are a sum over members of a mean over rows and targets, so that a member learns as it would
 alone. Checked against autograd in the tests.
 """
 
@@ -99,6 +99,31 @@ class GaussianNLL:
         mean, logvar = self.split(out)
         terms = 0.5 * (logvar + (mean - y) ** 2 * torch.exp(-logvar))
         return _mean(terms, weight)
+
+
+class ResidualNLL:
+    r"""Gaussian negative log likelihood of residuals, in their log variance alone.
+
+    The outputs are raw log variances, which a smooth clamp keeps between bounds (E, 1, k).
+    """
+
+    def __init__(self, low: Tensor, high: Tensor) -> None:
+        self.low, self.high = low, high
+
+    def parameters(self) -> list[Tensor]:
+        return []
+
+    def gradient(self, out: Tensor, y: Tensor, weight: Tensor | None) -> Tensor:
+        upper = self.high - softplus(self.high - out)
+        logvar = self.low + softplus(upper - self.low)
+        grad = 1.0 - y**2 * torch.exp(-logvar)
+        grad *= torch.sigmoid(self.high - out) * torch.sigmoid(upper - self.low)
+        grad *= 0.5 / y[0].numel()
+        return grad if weight is None else grad.mul_(weight)
+
+    def value(self, out: Tensor, y: Tensor, weight: Tensor | None) -> Tensor:
+        logvar = bounded(out, self.low, self.high)
+        return _mean(0.5 * (logvar + y**2 * torch.exp(-logvar)), weight)
 
 
 def _fill(parameter: Tensor, gradient: Tensor) -> None:

@@ -33,7 +33,7 @@ class Settings:
 
 @dataclass(frozen=True)
 class Validation:
-    """Held-out rows (n, d), (n, k), (n, 1) or None, and when to give up."""
+    """Held-out rows (n, d), (n, k) or (E, n, k), (n, 1) or None, and when to give up."""
 
     x: Tensor
     y: Tensor
@@ -197,7 +197,8 @@ class _BestWeights:
             part = slice(at, at + _VALIDATION_BLOCK)
             x = held_out.x[part].expand(self._network.n_members, -1, -1)
             weight = None if held_out.weight is None else held_out.weight[part]
-            value = self._loss.value(self._network.forward(x), held_out.y[part], weight)
+            y = held_out.y[..., part, :]
+            value = self._loss.value(self._network.forward(x), y, weight)
             total = total + value * (x.shape[1] / n_rows)
         return total
 

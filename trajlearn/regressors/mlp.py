@@ -2,17 +2,13 @@
 
 from collections.abc import Iterator, Sequence
 from numbers import Integral, Real
-from typing import Any, ClassVar, Literal, Self, overload
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.base import RegressorMixin
 from sklearn.utils import Tags, check_random_state
-from sklearn.utils.validation import (
-    _check_sample_weight,
-    check_is_fitted,
-    validate_data,
-)
+from sklearn.utils.validation import _check_sample_weight, validate_data
 
 from trajlearn._sklearn import Interval, StrOptions, fit_context
 from trajlearn.regressors._batches import (
@@ -25,8 +21,8 @@ from trajlearn.regressors._batches import (
 )
 from trajlearn.regressors._device import find_device
 from trajlearn.regressors._ensemble import Ensemble
+from trajlearn.regressors._fitted import FittedEnsemble
 from trajlearn.regressors._network import ACTIVATIONS
-from trajlearn.regressors._prediction import Predictor, bounded, mixture
 from trajlearn.regressors._samples import (
     Rows,
     bootstrap_counts,
@@ -35,6 +31,7 @@ from trajlearn.regressors._samples import (
     standardisation,
 )
 from trajlearn.regressors._training import Settings, Validation, default_steps
+from trajlearn.regressors._variance import VarianceEnsemble, out_of_bag
 
 __all__ = ["MLPEnsembleRegressor"]
 
@@ -44,9 +41,16 @@ Floats = NDArray[np.float64]
 _REFERENCE_ROWS = 16_384
 # training that ends further than this from the targets, in units of their spread, has failed
 _DIVERGED = 10.0
+# what a fit with networks of the variance sets beside the rest
+_OF_VARIANCE = {
+    "variance_coefs_",
+    "variance_intercepts_",
+    "variance_loss_curve_",
+    "_variance_moments",
+}
 
 
-class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
+class MLPEnsembleRegressor(RegressorMixin, FittedEnsemble):
     """Ensemble of E multilayer perceptrons, one batched network, for one or several targets.
 
     Targets are standardised inside; inputs are taken as they are, so scale them before (the
@@ -57,9 +61,13 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
     hidden_layer_sizes : sequence of int, default=(250, 250)
     n_members : int, default=1
         Networks E with their own initial weights and order of rows.
-    probabilistic : bool, default=False
-        Predict a mean and a variance for every row and train on the Gaussian likelihood.
-        Otherwise train on the squared error; the variance is then that of the training residuals.
+    probabilistic : bool or "separate", default=False
+        False: train on the squared error; the variance is that of the training residuals, the
+        same for every row. True: predict a mean and a variance and train both on the Gaussian
+        likelihood. "separate": the mean is that of False, to the bit; afterwards a smaller
+        network learns the variance of each member's residuals (in about a sixth more time), with
+        `bootstrap` on rows that the member has not seen. Other training residuals tell too small
+        a variance where the mean overfits.
     activation : {"silu", "relu", "tanh"}, default="silu"
     learning_rate : float, default=3e-3
         Peak rate of the schedule.
@@ -83,8 +91,8 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
         Evaluations (a hundredth of the steps apart) without improvement in any member before
         training ends.
     nll_beta : float, default=0.5
-        Exponent of beta-NLL for `probabilistic`; 0 is the plain likelihood, 1 weights the mean
-        as the squared error does.
+        Exponent of beta-NLL for ``probabilistic=True``; 0 is the plain likelihood, 1 weights the
+        mean as the squared error does.
     device : str, default="cpu"
     warm_start : bool, default=False
         Go on from the weights of the last fit.
@@ -104,7 +112,10 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
         Standard deviation of the training residuals, in target units.
     coefs_, intercepts_ : list of ndarray of shape (E, in, out), (E, 1, out)
     logvar_bounds_ : ndarray of shape (2, E, 1, n_targets)
-        Trained bounds of the log variance of standardised targets, if `probabilistic`.
+        Bounds of the log variance of standardised targets, if `probabilistic`: trained, or by the
+        range of the residuals if "separate".
+    variance_coefs_, variance_intercepts_, variance_loss_curve_
+        As `coefs_`, `intercepts_` and `loss_curve_`, of the networks of a "separate" variance.
     target_mean_, target_scale_ : ndarray of shape (n_targets,)
 
     See Also
@@ -128,15 +139,13 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
     True
     """
 
-    coefs_: list[NDArray[np.float32]]
-    intercepts_: list[NDArray[np.float32]]
-    logvar_bounds_: NDArray[np.float32]
     _moments: list[NDArray[np.float32]]
+    _variance_moments: list[NDArray[np.float32]]
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "hidden_layer_sizes": ["array-like"],
         "n_members": [Interval(Integral, 1, None, closed="left")],
-        "probabilistic": ["boolean"],
+        "probabilistic": ["boolean", StrOptions({"separate"})],
         "activation": [StrOptions(set(ACTIVATIONS))],
         "learning_rate": [Interval(Real, 0, None, closed="neither")],
         "schedule": [StrOptions({"one-cycle", "constant"})],
@@ -160,7 +169,7 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
         *,
         hidden_layer_sizes: Sequence[int] = (250, 250),
         n_members: int = 1,
-        probabilistic: bool = False,
+        probabilistic: bool | Literal["separate"] = False,
         activation: str = "silu",
         learning_rate: float = 3e-3,
         schedule: str = "one-cycle",
@@ -247,8 +256,12 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
             counts = bootstrap_counts(len(rows), by, self.n_members, rng)
         to_tensors = self._to_tensors()
         batches = row_batches(rows, counts, to_tensors, self.n_members, self.batch_size, rng)
-        self._train(batches, self._budget(len(rows)), rng, validation=validation)
-        self._set_residuals(rows, limit=_DIVERGED)
+        unseen = None
+        if counts is not None:
+            left_out = out_of_bag(counts)
+            unseen = row_batches(rows, left_out, to_tensors, self.n_members, self.batch_size, rng)
+        n_steps = self._budget(len(rows))
+        self._train(batches, rows, n_steps, rng, validation=validation, unseen=unseen)
         return self
 
     @fit_context(prefer_skip_nested_validation=True)
@@ -288,8 +301,7 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
             return to_tensors(*checked_draw(draw, n, rng, widths))
 
         batches = stream_batches(pool, self.n_members, self.batch_size)
-        self._train(batches, self._budget(n_rows or 10**9), rng)
-        self._set_residuals(rows, limit=_DIVERGED)
+        self._train(batches, rows, self._budget(n_rows or 10**9), rng)
         return self
 
     @fit_context(prefer_skip_nested_validation=True)
@@ -325,9 +337,7 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
         rng = np.random.default_rng(self._seed() + passed)
         self._set_target_scale(rows, keep=not first)
         batches = row_batches(rows, None, self._to_tensors(), self.n_members, self.batch_size, rng)
-        n_steps = -(-len(rows) // self.batch_size)
-        self._train(batches, n_steps, rng, go_on=not first, schedule="constant")
-        self._set_residuals(rows, limit=np.inf)
+        self._train(batches, rows, -(-len(rows) // self.batch_size), rng, one_pass=True)
         return self
 
     def _validated(
@@ -379,48 +389,97 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
     def _train(
         self,
         batches: Iterator[Batch],
+        rows: Rows,
         n_steps: int,
         rng: np.random.Generator,
         *,
         validation: Rows | None = None,
-        go_on: bool = False,
-        schedule: str | None = None,
+        unseen: Iterator[Batch] | None = None,
+        one_pass: bool = False,
     ) -> None:
+        """Train, and measure the residuals on `rows`; then the variance, where it is separate.
+
+        `unseen` are batches of what each bootstrapped member was not trained on.
+        """
+        fitted = hasattr(self, "coefs_")
+        go_on, moments = (one_pass or self.warm_start) and fitted, one_pass and fitted
+        schedule = "constant" if one_pass else self.schedule
+        settings = Settings(n_steps, self.learning_rate, schedule, verbose=bool(self.verbose))
+        held = None
+        if validation is not None:
+            tensors = self._to_tensors()(validation.X, validation.y, validation.weight)
+            held = Validation(*tensors, self.patience)
+        joint = self.probabilistic and not self._separate()
         ensemble = Ensemble(
             self.n_features_in_,
             len(self.target_mean_),
             self.hidden_layer_sizes,
             self.n_members,
             self.activation,
-            nll_beta=self.nll_beta if self.probabilistic else None,
+            nll_beta=self.nll_beta if joint else None,
             weight_decay=self.weight_decay,
             device=find_device(self.device),
             seed=int(rng.integers(2**62)),
         )
-        if go_on or self._goes_on():
-            moments = self._moments if go_on else None
-            ensemble.resume(self.coefs_, self.intercepts_, self.logvar_bounds_, moments)
-        schedule = schedule or self.schedule
-        settings = Settings(n_steps, self.learning_rate, schedule, verbose=bool(self.verbose))
-        held = None
-        if validation is not None:
-            tensors = self._to_tensors()(validation.X, validation.y, validation.weight)
-            held = Validation(*tensors, self.patience)
+        if go_on:
+            bounds = self.logvar_bounds_ if joint else ensemble.bounds()
+            ensemble.resume(
+                self.coefs_, self.intercepts_, bounds, self._moments if moments else None
+            )
         curves = ensemble.train(batches, settings, held)
         self.n_steps_, self.loss_curve_, self.validation_loss_curve_ = curves
         self.coefs_, self.intercepts_ = ensemble.weights(), ensemble.biases()
-        self.logvar_bounds_ = ensemble.bounds()
         self._moments = ensemble.optimizer.moments()
+        peak = self._set_residuals(rows, limit=np.inf if one_pass else _DIVERGED)
+        if self._separate():
+            variance = VarianceEnsemble(
+                ensemble.network,
+                self.activation,
+                residual_std=self.residual_std_ / self.target_scale_,
+                residual_peak=peak,
+                weight_decay=self.weight_decay,
+                seed=int(rng.integers(2**62)),
+            )
+            self._train_variance(variance, unseen or batches, settings, held, go_on, moments)
+            return
+        self.logvar_bounds_ = ensemble.bounds()
+        for name in _OF_VARIANCE & vars(self).keys():
+            delattr(self, name)
 
-    def _set_residuals(self, rows: Rows, *, limit: float) -> None:
+    def _train_variance(
+        self,
+        variance: VarianceEnsemble,
+        batches: Iterator[Batch],
+        settings: Settings,
+        held_out: Validation | None,
+        go_on: bool,
+        moments: bool,
+    ) -> None:
+        """Train the networks of the variance; a mean may go on where they are new."""
+        if go_on and hasattr(self, "variance_coefs_"):
+            variance.resume(
+                self.variance_coefs_,
+                self.variance_intercepts_,
+                self.logvar_bounds_,
+                self._variance_moments if moments else None,
+            )
+        _, self.variance_loss_curve_, _ = variance.train(batches, settings, held_out)
+        self.variance_coefs_, self.variance_intercepts_ = variance.weights(), variance.biases()
+        self.logvar_bounds_ = variance.bounds()
+        self._variance_moments = variance.optimizer.moments()
+
+    def _separate(self) -> bool:
+        return self.probabilistic == "separate"
+
+    def _set_residuals(self, rows: Rows, *, limit: float) -> Floats:
         """Spread of the residuals on (at most some thousand of) the training rows.
 
-        Raises, and leaves the estimator unfitted, if it exceeds `limit` times the targets' own.
+        Returns the greatest (E, n_targets), of standardised targets. Raises, and leaves the
+        estimator unfitted, if the spread exceeds `limit` times the targets' own.
         """
         rows = rows.thinned(_REFERENCE_ROWS)
-        means = self.predictor()(rows.X)[..., : rows.y.shape[1]]
-        squared = np.average((means - rows.y) ** 2, axis=1, weights=rows.weight)
-        self.residual_std_ = np.sqrt(squared)
+        residuals = self.predictor(means_only=True)(rows.X)[..., : rows.y.shape[1]] - rows.y
+        self.residual_std_ = np.sqrt(np.average(residuals**2, axis=1, weights=rows.weight))
         worst = float((self.residual_std_ / self.target_scale_).max())
         if not (worst < limit and np.isfinite(self.loss_curve_).all()):
             del self.coefs_
@@ -428,72 +487,5 @@ class MLPEnsembleRegressor(RegressorMixin, BaseEstimator):
                 f"training diverged (the residuals are {worst:.3g} times the spread of the "
                 f"targets): scale the inputs, or lower learning_rate (now {self.learning_rate:g})."
             )
-
-    def predictor(self) -> Predictor:
-        """Fast evaluation without validation, for roll-outs and planning.
-
-        Returns
-        -------
-        Predictor
-            ``predictor(X)`` gives means (E, n, n_targets), followed on the last axis by raw log
-            variances if `probabilistic`; see `moments`.
-        """
-        scale, shift = self.target_scale_, self.target_mean_
-        if self.probabilistic:
-            scale = np.concatenate([scale, np.ones_like(scale)])
-            shift = np.concatenate([shift, np.zeros_like(shift)])
-        return Predictor(
-            self.coefs_,
-            self.intercepts_,
-            self.activation,
-            device=find_device(self.device),
-            output_scale=scale,
-            output_shift=shift,
-        )
-
-    def moments(self, outputs: Floats) -> tuple[Floats, Floats]:
-        """Mean and variance of each member (E, n, n_targets) from a predictor's outputs."""
-        n_targets = len(self.target_mean_)
-        mean = outputs[..., :n_targets]
-        if not self.probabilistic:
-            variance = np.broadcast_to(self.residual_std_[:, None, :] ** 2, mean.shape)
-            return mean, variance
-        low, high = self.logvar_bounds_.astype(np.float64)
-        return mean, np.exp(bounded(outputs[..., n_targets:], low, high)) * self.target_scale_**2
-
-    def predict_members(self, X: ArrayLike) -> Floats:
-        """Mean of each member (E, n, n_targets).
-
-        Parameters
-        ----------
-        X : array-like of shape (n, n_features)
-        """
-        check_is_fitted(self, "coefs_")
-        rows: Floats = validate_data(self, X, reset=False, dtype=np.float64)
-        return self.predictor()(rows)[..., : len(self.target_mean_)]
-
-    @overload
-    def predict(self, X: ArrayLike, return_std: Literal[False] = False) -> Floats: ...
-    @overload
-    def predict(self, X: ArrayLike, return_std: Literal[True]) -> tuple[Floats, Floats]: ...
-    def predict(self, X: ArrayLike, return_std: bool = False) -> Floats | tuple[Floats, Floats]:
-        """Mean of the members.
-
-        Parameters
-        ----------
-        X : array-like of shape (n, n_features)
-        return_std : bool, default=False
-            Also return the standard deviation of the mixture of all members, in target units:
-            the mean of their variances plus the variance of their means.
-
-        Returns
-        -------
-        mean : ndarray of shape (n,) or (n, n_targets)
-        std : ndarray of the same shape, if asked for
-        """
-        check_is_fitted(self, "coefs_")
-        rows: Floats = validate_data(self, X, reset=False, dtype=np.float64)
-        mean, variance = mixture(*self.moments(self.predictor()(rows)))
-        if self._y_ndim == 1:
-            mean, variance = mean[:, 0], variance[:, 0]
-        return (mean, np.sqrt(variance)) if return_std else mean
+        greatest: Floats = np.abs(residuals).max(axis=1) / self.target_scale_
+        return greatest

@@ -1,0 +1,149 @@
+"""Forecasts of episodes by models that were not fitted on them, for calibration."""
+
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import clone
+from sklearn.frozen import FrozenEstimator
+from sklearn.model_selection import GroupKFold, GroupShuffleSplit, check_cv
+
+from trajlearn.dynamics._learner import seeded
+from trajlearn.dynamics.forecast import Forecast
+from trajlearn.exceptions import CalibrationWarning
+from trajlearn.trajectories import TrajectoryDataset
+
+__all__ = ["fit_and_forecast", "in_groups", "splits"]
+
+Ints = NDArray[np.intp]
+
+
+def in_groups(ds: TrajectoryDataset, groups: ArrayLike | None) -> TrajectoryDataset:
+    """The episodes with `groups`, if they are given, as their group.
+
+    Raises
+    ------
+    ValueError
+        If there is not one label an episode.
+    """
+    if groups is None:
+        return ds
+    labels = np.asarray(groups)
+    if labels.shape != (len(ds),):
+        raise ValueError(f"groups has shape {labels.shape}; give one label an episode ({len(ds)}).")
+    return TrajectoryDataset._of(replace(ds._columns, group=labels), ds._names)
+
+
+def splits(ds: TrajectoryDataset, cv: Any, rng: np.random.Generator) -> Iterator[tuple[Ints, Ints]]:
+    """Episodes to fit on and episodes held out: one pair, or one a fold.
+
+    Raises
+    ------
+    ValueError
+        If there are too few episodes (groups) to hold any out, or an episode is held out twice.
+    """
+    seed = int(rng.integers(2**31))
+    labels = ds.group
+    units = np.unique(np.arange(len(ds)) if labels is None else labels, return_inverse=True)[1]
+    n_units = int(units.max()) + 1
+    if n_units < 2:
+        raise ValueError(
+            f"calibration holds out whole {'episodes' if labels is None else 'groups'}, and there "
+            f"is only {n_units}: give more, or calibrate a fitted model on other episodes: "
+            "CalibratedForecaster(FrozenEstimator(model)).fit(episodes)."
+        )
+    if isinstance(cv, float):
+        # so that one unit is left to fit on, however large the share
+        held_out = min(int(np.ceil(cv * n_units - 1e-9)), n_units - 1)
+        splitter: Any = GroupShuffleSplit(1, test_size=held_out, random_state=seed)
+    elif labels is not None and (cv is None or isinstance(cv, Integral)):
+        splitter = GroupKFold(5 if cv is None else int(cv), shuffle=True, random_state=seed)
+    else:
+        splitter = check_cv(cv, shuffle=True, random_state=seed)
+    with warnings.catch_warnings():
+        # a splitter that has no use for groups was chosen knowingly
+        warnings.filterwarnings("ignore", "The groups parameter is ignored", UserWarning)
+        folds = list(splitter.split(ds, groups=units))
+    tested = np.zeros(len(ds), dtype=np.intp)
+    for train, test in folds:
+        tested[test] += 1
+        if tested.max() > 1:
+            raise ValueError(
+                f"cv = {cv!r} holds out an episode twice, but each is to count once: take a "
+                "splitter such as KFold or GroupKFold."
+            )
+        yield np.asarray(train), np.asarray(test)
+
+
+def fit_and_forecast(
+    estimator: Any, ds: TrajectoryDataset, *, cv: Any, start: int | str, rng: np.random.Generator
+) -> tuple[Any, Forecast, TrajectoryDataset]:
+    """Fit an estimator, and forecast episodes that it was not fitted on.
+
+    Parameters
+    ----------
+    estimator : dynamics estimator or Pipeline
+        A `FrozenEstimator` is not fitted and forecasts all episodes.
+    ds : TrajectoryDataset
+    cv, start
+        As in `CalibratedForecaster`.
+    rng : Generator
+
+    Returns
+    -------
+    fitted : estimator
+        On the episodes that are not held out, or on all if `cv` is not a share.
+    forecast : Forecast
+        One of each episode that goes beyond its start, with `std` if the estimator has one.
+    truth : TrajectoryDataset
+        These episodes.
+    """
+    if isinstance(estimator, FrozenEstimator):
+        return estimator, *_forecast(estimator, ds, start, rng)
+    unfitted, fitted = seeded(estimator, rng), None
+    parts = []
+    for train, test in splits(ds, cv, rng):
+        fitted = clone(unfitted).fit(ds[train])
+        parts.append(_forecast(fitted, ds[test], start, rng))
+    forecasts, truths = zip(*parts)
+    joined: Any = np.concatenate(forecasts) if len(parts) > 1 else forecasts[0]
+    if not isinstance(cv, float):
+        fitted = unfitted.fit(ds)
+    return fitted, joined, truths[0].concatenate(*truths[1:])
+
+
+def _forecast(
+    model: Any, ds: TrajectoryDataset, start: int | str, rng: np.random.Generator
+) -> tuple[Forecast, TrajectoryDataset]:
+    """One forecast of each episode that is long enough, and these episodes."""
+    starts = rng.integers(0, ds.lengths) if start == "random" else np.full(len(ds), start)
+    long = ds.lengths > starts
+    if not long.all():
+        if not long.any():
+            raise ValueError(
+                f"no held-out episode goes beyond start = {start} (the longest has "
+                f"{ds.lengths.max()} steps): calibrate from an earlier start."
+            )
+        warnings.warn(
+            f"{(~long).sum()} of {len(ds)} held-out episodes end at start = {start} or "
+            "before, and do not calibrate.",
+            CalibrationWarning,
+            stacklevel=5,
+        )
+        ds, starts = ds[long], starts[long]
+    settings: dict[str, Any] = {"start": starts, "random_state": int(rng.integers(2**31))}
+    try:
+        forecast = model.predict(ds, return_std=True, **settings)
+    except ValueError:
+        # it gives no standard deviation; any other error comes again
+        forecast = model.predict(ds, **settings)
+    if not isinstance(forecast, Forecast):
+        raise TypeError(
+            f"{type(model).__name__} predicts {type(forecast).__name__}, not a Forecast: give a "
+            "dynamics estimator, or a Pipeline that ends in one."
+        )
+    return forecast, ds
