@@ -11,6 +11,7 @@ from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import Pipeline
 
 from trajlearn import (
+    CalibratedForecaster,
     DirectRewardGP,
     DirectRewardNN,
     LinearFeedback,
@@ -56,6 +57,12 @@ CASES = {
     "T sklearn GP": (TrajectoryRegressor(GP, relabeler=few(80)), {"same_bits": False}, set()),
     "D": (D, {"policy": FEEDBACK}, {"std"}),
     "PE": (OneStepRegressor().set_params(**SMALL | THREE), {"policy": FEEDBACK}, {"std"}),
+    "PE unscented": (
+        OneStepRegressor(propagation="unscented").set_params(**SMALL | THREE),
+        {"policy": FEEDBACK},
+        {"std"},
+    ),
+    "calibrated T": (CalibratedForecaster(T), {}, {"rows_and", "bad_rows"}),
     "D by policy": (OneStepRegressor(policy=FEEDBACK).set_params(**SMALL), {}, {"std"}),
     "D linear": (
         LINEAR,

@@ -190,9 +190,10 @@ class Forecaster(BaseEstimator):
         Returns
         -------
         mean : ndarray of shape (n,)
-            -inf where the forecast diverged.
+            Reward of the mean trajectory, which for a curved reward is not the mean reward of the
+            samples; -inf where the forecast diverged.
         std : ndarray of shape (n,), if asked for
-            inf where some trajectory diverged.
+            Of the rewards of the samples; inf where some trajectory diverged.
         """
         if reward is None:
             raise ValueError(

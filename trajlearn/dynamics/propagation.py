@@ -32,7 +32,9 @@ The five agree on one step: mean and variance are those of the mixture of all me
 - "moment" propagates mean and covariance through the slopes of the learned mean at the mean, and
   adds the learned variance there [3]_: right for small spreads of smooth maps. Slopes are central
   differences of the whole step (policy, features, learner), 1/1000 of the training range to each
-  side: any learner will do, but the slope of a forest of trees is zero.
+  side: any learner will do, but the slope of a forest of trees is zero, and where an actuator
+  saturates the slope at the mean is that of no control at all, so that the spread of an unstable
+  plant grows without end: particles know better.
 - With a `GPRegressor` with the RBF kernel as learner, "moment" is the exact mean and covariance
   of the GP at a Gaussian input [2]_, with the uncertainty about the function in it: PILCO's
   model. Policy and scaling enter by their slopes. Those of the scalers' defaults are exact, those

@@ -1,7 +1,7 @@
 """How far ahead forecasts may be trusted, with a guarantee that holds for small test sets."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import ceil, log
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,7 @@ Ints = NDArray[np.intp]
 Tolerance = float | Mapping[str, float]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class TrustHorizon:
     """How far ahead a forecaster may be trusted; made by `trust_horizon`.
 
@@ -57,7 +57,14 @@ class TrustHorizon:
     confidence: float
     tolerance: Tolerance
     n_episodes: int
-    table: "pd.DataFrame" = field(repr=False)
+    table: "pd.DataFrame"
+
+    def __repr__(self) -> str:
+        return (
+            f"TrustHorizon(horizon={self.horizon}, time={self.time:.6g}, limit={self.limit!r}, "
+            f"share={self.share:g}, confidence={self.confidence:g}, "
+            f"tolerance={self.tolerance!r}, n_episodes={self.n_episodes})"
+        )
 
 
 def trust_horizon(
