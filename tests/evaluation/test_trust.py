@@ -195,7 +195,7 @@ def test_the_order_of_the_episodes_does_not_matter():
 def test_the_result_is_short_to_print():
     trust = trust_horizon(*known(np.zeros((30, 4))), 0.1)
     assert repr(trust) == (
-        "TrustHorizon(horizon=4, time=2.0, limit='forecast', share=0.9, confidence=0.95, "
+        "TrustHorizon(horizon=4, time=2, limit='forecast', share=0.9, confidence=0.95, "
         "tolerance=0.1, n_episodes=30)"
     )
 

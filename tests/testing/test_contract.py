@@ -60,7 +60,7 @@ CASES = {
     "PE unscented": (
         OneStepRegressor(propagation="unscented").set_params(**SMALL | THREE),
         {"policy": FEEDBACK},
-        {"std"},
+        set(),
     ),
     "calibrated T": (CalibratedForecaster(T), {}, {"rows_and", "bad_rows"}),
     "D by policy": (OneStepRegressor(policy=FEEDBACK).set_params(**SMALL), {}, {"std"}),
