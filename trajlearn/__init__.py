@@ -67,6 +67,7 @@ _MODULE_OF = {
     "InvalidEpisodeError": "exceptions",
     "MissingFieldError": "exceptions",
     "MixedSamplingError": "exceptions",
+    "NoUncertaintyError": "exceptions",
     "SmoothingWarning": "exceptions",
     "UnknownFileError": "exceptions",
 }

@@ -10,6 +10,7 @@ __all__ = [
     "InvalidEpisodeError",
     "MissingFieldError",
     "MixedSamplingError",
+    "NoUncertaintyError",
     "SmoothingWarning",
     "UnknownFileError",
 ]
@@ -31,6 +32,10 @@ class UnknownFileError(ValueError):
     """A file is not one of this package's, was truncated or was changed by hand."""
 
 
+class NoUncertaintyError(ValueError):
+    """An estimator was asked for a standard deviation or samples that it cannot give."""
+
+
 class CalibrationWarning(UserWarning):
     """An interval or a standard deviation goes beyond what the calibration episodes say."""
 
@@ -40,7 +45,7 @@ class DivergenceWarning(UserWarning):
 
 
 class HorizonWarning(UserWarning):
-    """A forecast reaches beyond the longest horizon seen in training."""
+    """A forecast reaches beyond the longest horizon of training, or its std of calibration."""
 
 
 class SmoothingWarning(UserWarning):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import betabinom, norm
 from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
 from sklearn.frozen import FrozenEstimator
 from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import GridSearchCV, GroupKFold, KFold, ShuffleSplit
@@ -270,6 +271,43 @@ def test_the_method_variance_has_gaussian_intervals():
     np.testing.assert_allclose(
         drawn.interval(0.8)[0], np.quantile(drawn.samples, 0.1, axis=0, method="weibull")
     )
+
+
+def test_a_fit_that_fails_leaves_no_calibration_behind():
+    ds = decays(30, seed=1)
+    model = CalibratedForecaster(Decay(), random_state=0).fit(ds)
+    with pytest.raises(ValueError, match="to calibrate on"):
+        model.fit(ds[:3])
+    with pytest.raises(NotFittedError):
+        model.predict(ds[:3], return_std=True)
+
+
+def test_the_episodes_that_calibrated_are_named():
+    ds = decays(30, seed=1)
+    model = CalibratedForecaster(Decay(), cv=0.4, random_state=0).fit(ds)
+    used = np.isin(ds.ids, model.calibration_ids_)
+    assert used.sum() == 12
+    same = frozen(ds[used], model.estimator_)
+    np.testing.assert_array_equal(np.sort(same.calibration_ids_), np.sort(model.calibration_ids_))
+    np.testing.assert_allclose(
+        np.ptp(same.predict(ds, return_std=True).interval(0.5), axis=0),
+        np.ptp(model.predict(ds, return_std=True).interval(0.5), axis=0),
+    )
+
+
+class Moody(Decay):
+    """Fails with another error where it is asked for a standard deviation."""
+
+    def _refuse_uncertainty(self, request):
+        if request.return_std:
+            raise ValueError("the policy knows no such state")
+
+
+def test_an_error_that_comes_with_the_std_alone_is_told():
+    ds = decays(30, seed=1)
+    with pytest.warns(CalibrationWarning, match="knows no such state"):
+        model = frozen(ds, Moody(gives_std=False).fit(ds))
+    assert not model.has_std_
 
 
 # -- the standard deviation ---------------------------------------------------------------

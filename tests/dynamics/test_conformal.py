@@ -70,6 +70,43 @@ def test_a_floor_stands_for_what_the_model_does_not_know(noise):
         np.testing.assert_allclose((np.abs(z[small]) < 1.645).mean(), 0.9, atol=0.05)
 
 
+def test_rows_without_std_do_not_say_how_high_the_floor_is():
+    rng = np.random.default_rng(0)
+    errors = rng.normal(size=(300, 1, 1))
+    for share in (0.2, 0.5):
+        std = np.where(rng.uniform(size=errors.shape) < share, 1e-9, 0.5)
+        rescaled = crps_rescaling(residuals(errors, std)).of(std, np.array([0]))
+        np.testing.assert_allclose(rescaled, 1.0, atol=0.2)
+
+
+def test_nearly_always_exact_is_not_certain():
+    rng = np.random.default_rng(0)
+    errors = np.where(rng.uniform(size=(100, 4, 1)) < 0.2, 1.0, 0.0)
+    found = crps_rescaling(residuals(errors))
+    np.testing.assert_allclose(found.factor, 0.2, atol=0.15)
+
+
+def test_an_infinite_std_stays_infinite():
+    rescaling = Rescaling(np.full((2, 1), 0.5), np.ones((2, 1)))
+    std = np.array([[np.inf], [np.nan]])
+    np.testing.assert_array_equal(rescaling.of(std, np.arange(2)), std)
+
+
+@pytest.mark.parametrize("band", ["marginal", "simultaneous"])
+def test_bands_of_an_infinite_std_are_infinite(band):
+    # an error of 0 standard deviations, where nothing is known, must not shrink the others
+    calibration = residuals(
+        np.full((9, 1, 1), 2.0), np.array([np.inf] * 5 + [1.0] * 4)[:, None, None]
+    )
+    bands = (
+        marginal_bands(calibration, np.ones(1))
+        if band == "marginal"
+        else simultaneous_bands(calibration, as_given(1, 1), np.ones(1))
+    )
+    widths = bands.at(0.3, np.array([0]), np.array([[[np.inf]], [[1.0]]]))
+    np.testing.assert_array_equal(widths.ravel(), [np.inf, 0.0])
+
+
 def test_a_floor_never_costs_crps():
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -160,6 +197,25 @@ def test_the_largest_score_counts_in_units_of_the_modulation():
     np.testing.assert_array_equal(widths, 2 * np.array([[[1.0, 4.0], [2.0, 5.0]]]))
 
 
+def test_simultaneous_bands_end_with_the_longest_episode():
+    errors = np.random.default_rng(0).normal(size=(20, 6, 2))
+    errors[:, 4:] = np.nan
+    bands = simultaneous_bands(residuals(errors), as_given(6, 2), np.arange(1.0, 7.0))
+    widths = bands.multiples(0.5, np.arange(6))
+    assert np.isfinite(widths[:4]).all()
+    assert np.isinf(widths[4:]).all()
+
+
+def test_nobody_is_warned_of_states_that_were_never_logged(recwarn):
+    errors = np.random.default_rng(0).normal(size=(20, 3, 2))
+    errors[..., 1] = np.nan
+    bands = np.full(2, marginal_bands(residuals(errors), np.arange(1.0, 4.0)), dtype=object)
+    half_widths(bands, 0.5, np.ones((2, 3, 2)), np.arange(1, 4), np.array([3, 3]))
+    assert not recwarn.list
+    with pytest.warns(CalibrationWarning, match="3 of 3 horizons"):
+        half_widths(bands, 0.99, np.ones((2, 3, 2)), np.arange(1, 4), np.array([3, 3]))
+
+
 def test_a_state_that_was_never_logged_has_no_band():
     scores = np.array([[[1.0, np.nan]], [[2.0, np.nan]]])
     elapsed = np.ones(1)
@@ -227,9 +283,14 @@ def test_noise_of_ragged_and_diverged_episodes_has_variance_one():
 def test_a_state_that_was_never_logged_has_noise_of_its_own():
     errors = np.random.default_rng(0).normal(size=(40, 3, 2)) + 2.0
     errors[..., 1] = np.nan
-    values = residual_paths(residuals(errors)).values
-    np.testing.assert_allclose((values**2).sum(axis=0), 1.0)
-    assert abs((values[..., 0] * values[..., 1]).sum(axis=0)).max() < 0.3
+    errors = np.concatenate([errors, errors[..., 1:]], axis=2)
+    paths = residual_paths(residuals(errors))
+    rng = np.random.default_rng(0)
+    drawn = paths.draw(rng, (20_000, 1), np.arange(3)).reshape(20_000, 9)
+    expected = np.kron(np.ones((3, 3)), np.diag([0, 1.0, 1.0]))
+    values = paths.values[..., 0]
+    expected[::3, ::3] = values.T @ values
+    np.testing.assert_allclose(drawn.T @ drawn / 20_000, expected, atol=0.03)
 
 
 # -- episodes -----------------------------------------------------------------------------

@@ -201,9 +201,8 @@ def test_bands_come_before_samples():
     np.testing.assert_allclose(lower, forecast.mean - 3 * raw_std)
     assert np.isfinite(upper[known]).all()
     assert np.isnan(upper[~known]).all()
-    # they scale a std, and are of no use without one
-    without = make(bands=bands(3, 3.0))
-    np.testing.assert_array_equal(without.interval(0.9), make().interval(0.9))
+    with pytest.raises(ValueError, match="bands need raw_std"):
+        make(bands=bands(3, 3.0))
 
 
 def test_bands_go_along():
@@ -220,7 +219,9 @@ def test_bands_go_along():
         joined.at([2, 3]).interval(0.5)[0], joined.interval(0.5)[0][:, [1, 2]]
     )
     assert repr(first) == "Forecast(n=3, H=4, d_s=2, std, samples=5, bands)"
-    assert np.concatenate([first, make()]).bands is None
+    # a guarantee must not be lost on the way
+    with pytest.raises(ValueError, match="others have none"):
+        np.concatenate([first, make()])
 
 
 def test_residuals_are_logged_minus_predicted():

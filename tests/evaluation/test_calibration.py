@@ -26,8 +26,13 @@ INF, NAN = np.inf, np.nan
 COLUMNS = ["first", "last", "state", "measure", "level", "value", "low", "high"]
 
 
+LEVELS = {"levels": (0.5, 0.9, 0.95)}
+
+
 def report_of(forecast, ds, **arguments):
-    return calibration_report(forecast, ds, **{"n_bootstrap": 0, "random_state": 0, **arguments})
+    return calibration_report(
+        forecast, ds, **LEVELS | {"n_bootstrap": 0, "random_state": 0} | arguments
+    )
 
 
 def pick(table, state="all", first=1, **keys):
@@ -466,7 +471,7 @@ def test_bands_decide_the_intervals_and_the_gaussian_the_scores(monkeypatch):
     rng = np.random.default_rng(0)
     ds = walks(rng, [9, 6, 7])
     plain = around(ds, rng, n_samples=9)
-    forecast = plain._replace(bands=np.full(3, "bands", dtype=object))
+    forecast = plain._replace(bands=np.full(3, "bands", dtype=object), raw_std=plain.std)
     # bands as wide as a fifth of the level
     monkeypatch.setattr(
         type(forecast),

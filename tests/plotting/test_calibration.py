@@ -16,6 +16,7 @@ from trajlearn.plotting.fan import plot_fan
 plt = pytest.importorskip("matplotlib.pyplot")
 INF, NAN = np.inf, np.nan
 FEW = {"n_bootstrap": 20, "random_state": 0}
+REPORT = FEW | {"levels": (0.5, 0.9, 0.95)}
 
 
 @pytest.fixture(autouse=True)
@@ -61,8 +62,8 @@ def rows(table, state="all", **keys):
 
 def test_coverage_of_bins_beside_the_promise(flights, forecast, diverging):
     reports = {
-        "good": calibration_report(forecast, flights, **FEW),
-        "bad": calibration_report(diverging, flights, **FEW),
+        "good": calibration_report(forecast, flights, **REPORT),
+        "bad": calibration_report(diverging, flights, **REPORT),
     }
     axes = plot_coverage(reports, state="y")
     assert [ax.get_title() for ax in axes] == [f"{p} % intervals" for p in (50, 90, 95)]
@@ -85,7 +86,7 @@ def test_coverage_of_bins_beside_the_promise(flights, forecast, diverging):
 
 
 def test_coverage_of_every_horizon_is_a_shaded_curve(flights, forecast):
-    report = calibration_report(forecast, flights, bins=None, **FEW)
+    report = calibration_report(forecast, flights, bins=None, **REPORT)
     (ax,) = plot_coverage(report, levels=[0.5])
     expected = rows(report, measure="coverage", level=0.5)
     assert_allclose(curves(ax)["forecast"], expected[["first", "value"]])
@@ -97,7 +98,7 @@ def test_coverage_of_every_horizon_is_a_shaded_curve(flights, forecast):
 
 
 def test_axes_can_be_given(flights, forecast):
-    report = calibration_report(forecast, flights, **FEW)
+    report = calibration_report(forecast, flights, **REPORT)
     _, given = plt.subplots(1, 3)
     assert list(plot_coverage(report, given)) == list(given)
     assert given[0].get_legend() is not None
@@ -108,8 +109,8 @@ def test_axes_can_be_given(flights, forecast):
 
 def test_the_shared_levels_are_drawn(flights, forecast):
     reports = {
-        "a": calibration_report(forecast, flights, levels=[0.5, 0.9], **FEW),
-        "b": calibration_report(forecast, flights, levels=[0.9, 0.99], **FEW),
+        "a": calibration_report(forecast, flights, **REPORT | {"levels": [0.5, 0.9]}),
+        "b": calibration_report(forecast, flights, **REPORT | {"levels": [0.9, 0.99]}),
     }
     assert [ax.get_title() for ax in plot_coverage(reports)] == ["90 % intervals"]
     with pytest.raises(ValueError, match=r"levels = \[0.5\] are not in every report"):
@@ -129,7 +130,7 @@ def test_reliability_goes_along_the_diagonal_a_panel_a_bin(flights, forecast, di
         assert_allclose(curves(ax)["ideal"], [[0, 0], [1, 1]])
         assert len(ax.collections) == 1
     # a report has some of the levels
-    report = calibration_report(forecast, flights, levels=[0.9, 0.2], **FEW)
+    report = calibration_report(forecast, flights, **REPORT | {"levels": [0.9, 0.2]})
     assert_allclose(curves(plot_reliability(report)[0])["forecast"][:, 0], [0.2, 0.9])
     with pytest.raises(ValueError, match="30 panels, one a bin, cannot be read"):
         plot_reliability(reliability(forecast, flights, bins=None, **FEW))
@@ -153,7 +154,7 @@ def test_pit_bars_have_the_heights_of_the_table(flights, forecast, diverging):
 
 
 def test_tables_of_another_kind_are_refused(flights, forecast):
-    report = calibration_report(forecast, flights, **FEW)
+    report = calibration_report(forecast, flights, **REPORT)
     histogram = pit_histogram(forecast, flights, **FEW)
     for plot, table in (
         (plot_coverage, histogram),
@@ -181,10 +182,10 @@ def test_a_fan_opens_from_the_initial_state(flights, forecast):
     assert_allclose(drawn["forecast"][1:, 1], forecast.mean[2, :28, 1])
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("time (s)", "y (m)")
     labels = [band.get_label() for band in ax.collections]
-    assert labels == ["95 %", "90 %", "50 %"]
+    assert labels == ["90 %", "50 %"]
     shades = [band.get_facecolor()[0, :3].mean() for band in ax.collections]
     assert shades == sorted(shades, reverse=True)
-    for band, level in zip(ax.collections, (0.95, 0.9, 0.5)):
+    for band, level in zip(ax.collections, (0.9, 0.5)):
         initial = flights[2].states[0, 1]
         lower, upper = (np.append(initial, b[2, :28, 1]) for b in forecast.interval(level))
         box = band.get_paths()[0].get_extents()
@@ -242,7 +243,7 @@ def test_what_has_no_fan_is_refused(flights, forecast):
 
 
 def test_a_missing_matplotlib_says_what_to_install(flights, forecast, monkeypatch):
-    report = calibration_report(forecast, flights, **FEW)
+    report = calibration_report(forecast, flights, **REPORT)
     histogram = pit_histogram(forecast, flights, **FEW)
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     for plot, arguments in (

@@ -25,6 +25,8 @@ _WINDOW, _KNOTS = 1.1, 1.05
 # floors that are tried, in typical standard deviations; each has to save this share of the CRPS
 _FLOORS = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
 _WORTH = 2e-3
+# share of the largest standard deviation below which one does not say what is typical
+_TELLING = 1e-6
 # of a model that makes no error at all
 _LEAST_FACTOR = 1e-12
 
@@ -174,8 +176,10 @@ def _window(knot: int, reach: int) -> tuple[int, int]:
 def _best(errors: Floats, std: Floats) -> Floats:
     """Factor and floor (2, d) of least CRPS, from residuals (m, d) where `std` is not 0."""
     count = np.maximum((std > 0).sum(axis=0), 1)
-    logs = np.log(std, out=np.zeros_like(std), where=std > 0)
-    typical = np.exp(logs.sum(axis=0) / count)
+    # rows of (nearly) no std are those that need a floor, and do not tell how high it should be
+    told = std > _TELLING * std.max(axis=0, initial=0.0)
+    logs = np.log(std, out=np.zeros_like(std), where=told)
+    typical = np.exp(logs.sum(axis=0) / np.maximum(told.sum(axis=0), 1))
     best = np.full((2, std.shape[1]), np.nan)
     least = np.full(std.shape[1], np.inf)
     for ratio in _FLOORS:
@@ -186,8 +190,7 @@ def _best(errors: Floats, std: Floats) -> Floats:
         better = score < (1 - _WORTH) * least
         least = np.where(better, score, least)
         best = np.where(better, [factor, factor * ratio * typical], best)
-    # of no error at all
-    return np.where(np.isnan(best) & (std > 0).any(axis=0), [[_LEAST_FACTOR], [0.0]], best)
+    return best
 
 
 def _mean_crps(errors: Floats, std: Floats, count: Ints) -> Floats:
@@ -221,5 +224,8 @@ def _root(errors: Floats, std: Floats) -> Floats:
             u = np.where(slope > 0, u + step, np.inf)
             if not (step > 1e-10 * u).any():
                 break
-        factor = np.maximum(np.sqrt(1 / (2 * u)), _LEAST_FACTOR)
+        # with so many errors of 0 no factor is best, and certainty the worst answer
+        exact = (weight * (ratio == 0)).sum(axis=0) >= np.sqrt(0.5)
+        found = np.where(exact, np.abs(errors).sum(axis=0) / total, np.sqrt(1 / (2 * u)))
+        factor = np.maximum(found, _LEAST_FACTOR)
     return np.where(total > 0, factor, np.nan)

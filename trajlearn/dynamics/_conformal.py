@@ -81,7 +81,11 @@ class ConformalBands:
         std : ndarray of shape (m, len(steps), d_s)
             Standard deviations as the model gives them.
         """
-        return self.multiples(level, steps) * self.modulation.of(std, steps)
+        unit = self.modulation.of(std, steps)
+        with np.errstate(invalid="ignore"):
+            widths = self.multiples(level, steps) * unit
+        # a score of 0 says nothing where the model does not know at all
+        return np.where(np.isinf(unit), np.inf, widths)
 
     def multiples(self, level: float, steps: Ints) -> Floats:
         """Half widths in the unit of the scores (len(steps), d_s)."""
@@ -130,7 +134,10 @@ def simultaneous_bands(
     scores = residuals.rescaled(modulation).standardised
     largest = np.nanmax(np.abs(scores), axis=(1, 2))
     ever = ~np.isnan(scores).all(axis=(0, 1))
-    logged = np.broadcast_to(ever, scores.shape[1:]).copy()
+    reached = ~np.isnan(scores).all(axis=(0, 2))
+    # an episode may end early, but not all of them
+    within = np.flip(np.logical_or.accumulate(np.flip(reached)))
+    logged = within[:, None] & ever
     return ConformalBands(np.sort(largest), modulation, logged, elapsed)
 
 
@@ -175,7 +182,9 @@ def half_widths(
         own = np.array([other is one for other in bands])
         steps = steps_of(horizons, one.elapsed)
         widths[own] = one.at(level, steps, std[own])
-        infinite = np.isinf(one.multiples(level, steps)[: lengths[own].max()])
+        # nothing is asked of states that nobody logged
+        asked = one.multiples(level, steps)[: lengths[own].max(), one.logged.any(axis=0)]
+        infinite = np.isinf(asked)
         if infinite.any():
             _warn_infinite(one, level, infinite.any(axis=1), horizons)
     return widths
@@ -186,11 +195,12 @@ def _warn_infinite(
 ) -> None:
     first = horizons[np.argmax(infinite)]
     least = int(np.ceil(level / (1 - level) - 1e-9))
+    half = " (simultaneous bands: twice as many)" if bands.band == "simultaneous" else ""
     warnings.warn(
         f"{infinite.sum()} of {len(infinite)} horizons (first {first}) have infinite intervals: "
         f"at level {level:g} bands need {least} or more calibration episodes that reach the "
-        f"horizon and do not diverge ({bands!r}). Calibrate on more or longer episodes, ask for "
-        'a lower level, or take method="variance".',
+        f"horizon and do not diverge{half} ({bands!r}). Calibrate on more or longer episodes, ask "
+        'for a lower level, or take method="variance".',
         CalibrationWarning,
         stacklevel=4,
     )

@@ -3,7 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from dataclasses import replace
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from sklearn.model_selection import GroupKFold, GroupShuffleSplit, check_cv
 
 from trajlearn.dynamics._learner import seeded
 from trajlearn.dynamics.forecast import Forecast
-from trajlearn.exceptions import CalibrationWarning
+from trajlearn.exceptions import CalibrationWarning, NoUncertaintyError
 from trajlearn.trajectories import TrajectoryDataset
 
 __all__ = ["fit_and_forecast", "in_groups", "splits"]
@@ -38,6 +38,10 @@ def in_groups(ds: TrajectoryDataset, groups: ArrayLike | None) -> TrajectoryData
     return TrajectoryDataset._of(replace(ds._columns, group=labels), ds._names)
 
 
+def _is_share(cv: Any) -> bool:
+    return isinstance(cv, Real) and not isinstance(cv, Integral)
+
+
 def splits(ds: TrajectoryDataset, cv: Any, rng: np.random.Generator) -> Iterator[tuple[Ints, Ints]]:
     """Episodes to fit on and episodes held out: one pair, or one a fold.
 
@@ -56,7 +60,7 @@ def splits(ds: TrajectoryDataset, cv: Any, rng: np.random.Generator) -> Iterator
             f"is only {n_units}: give more, or calibrate a fitted model on other episodes: "
             "CalibratedForecaster(FrozenEstimator(model)).fit(episodes)."
         )
-    if isinstance(cv, float):
+    if _is_share(cv):
         # so that one unit is left to fit on, however large the share
         held_out = min(int(np.ceil(cv * n_units - 1e-9)), n_units - 1)
         splitter: Any = GroupShuffleSplit(1, test_size=held_out, random_state=seed)
@@ -110,8 +114,10 @@ def fit_and_forecast(
         fitted = clone(unfitted).fit(ds[train])
         parts.append(_forecast(fitted, ds[test], start, rng))
     forecasts, truths = zip(*parts)
+    if len({forecast.std is None for forecast in forecasts}) > 1:
+        raise ValueError("the estimator gives a standard deviation in some folds, not in others.")
     joined: Any = np.concatenate(forecasts) if len(parts) > 1 else forecasts[0]
-    if not isinstance(cv, float):
+    if not _is_share(cv):
         fitted = unfitted.fit(ds)
     return fitted, joined, truths[0].concatenate(*truths[1:])
 
@@ -138,9 +144,17 @@ def _forecast(
     settings: dict[str, Any] = {"start": starts, "random_state": int(rng.integers(2**31))}
     try:
         forecast = model.predict(ds, return_std=True, **settings)
-    except ValueError:
-        # it gives no standard deviation; any other error comes again
+    except NoUncertaintyError:
         forecast = model.predict(ds, **settings)
+    except ValueError as error:
+        # an estimator written elsewhere may say so in other ways; an error of predict comes again
+        forecast = model.predict(ds, **settings)
+        warnings.warn(
+            f"{type(model).__name__} failed with return_std=True ({error}) and without it did not: "
+            "it is calibrated as a model without a standard deviation.",
+            CalibrationWarning,
+            stacklevel=5,
+        )
     if not isinstance(forecast, Forecast):
         raise TypeError(
             f"{type(model).__name__} predicts {type(forecast).__name__}, not a Forecast: give a "

@@ -11,6 +11,7 @@ from sklearn.multioutput import MultiOutputRegressor
 from sklearn.utils import get_tags
 from sklearn.utils.validation import has_fit_parameter
 
+from trajlearn.exceptions import NoUncertaintyError
 from trajlearn.regressors._prediction import mixture as mixture_of_members
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 
@@ -160,7 +161,7 @@ def required(variances: Floats | None, learner: Any) -> Floats:
         If it gives none.
     """
     if variances is None:
-        raise ValueError(
+        raise NoUncertaintyError(
             f"{type(learner).__name__} gives no standard deviation. Use MLPEnsembleRegressor, "
             "GPRegressor or any regressor whose predict takes return_std."
         )

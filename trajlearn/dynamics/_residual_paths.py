@@ -27,9 +27,13 @@ class ResidualPaths:
     ----------
     values : ndarray of shape (n, H, d_s)
         Z_i / sqrt(n).
+    logged : ndarray of shape (d_s,)
+        States with residuals; each of the others gets a number of its own, constant over
+        horizons.
     """
 
     values: Floats
+    logged: NDArray[np.bool_]
 
     @property
     def reach(self) -> int:
@@ -40,20 +44,21 @@ class ResidualPaths:
         """Independent paths (*shape, len(steps), d_s); beyond the last step they stay."""
         held = self.values[:, np.minimum(steps, self.reach - 1)]
         noise = rng.standard_normal((*shape, len(held)))
-        return np.tensordot(noise, held, axes=1)
+        paths: Floats = np.tensordot(noise, held, axes=1)
+        if not self.logged.all():
+            unknown = rng.standard_normal((*shape, 1, int((~self.logged).sum())))
+            paths[..., ~self.logged] = unknown
+        return paths
 
 
 def residual_paths(residuals: Residuals) -> ResidualPaths:
     """Paths of the residuals (one episode or more), to the last step that enough of them reach.
 
-    Diverged cells are left out. A state that was never logged gets a constant over horizons,
-    independent of the others.
+    Diverged cells are left out.
     """
     reach = max(residuals.reach, 1)
     usable = residuals.usable[:, :reach]
     values = np.where(usable, residuals.standardised[:, :reach], 0.0)
     power = np.sqrt((values**2).sum(axis=0))
     values = np.divide(values, power, out=np.zeros_like(values), where=power > 0)
-    signs = np.where(np.arange(len(values)) % 2, -1.0, 1.0) / np.sqrt(len(values))
-    values[:, :, ~usable.any(axis=(0, 1))] = signs[:, None, None]
-    return ResidualPaths(values)
+    return ResidualPaths(values, np.asarray(usable.any(axis=(0, 1))))

@@ -13,7 +13,7 @@ from trajlearn._sklearn import fit_context
 from trajlearn.dynamics._forecaster import Forecaster, Prediction, Request
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics.forecast import Forecast
-from trajlearn.exceptions import MissingFieldError
+from trajlearn.exceptions import MissingFieldError, NoUncertaintyError
 from trajlearn.trajectories import TrajectoryDataset, as_dataset
 from trajlearn.trajectories._signals import interpolate
 from trajlearn.trajectories.times import time_steps
@@ -99,7 +99,7 @@ class EpisodeForecaster(SaveMixin, Forecaster):
 
     def _refuse_uncertainty(self, request: Request) -> None:
         if request.return_std or request.n_samples:
-            raise ValueError(
+            raise NoUncertaintyError(
                 f"{type(self).__name__} gives no uncertainty: leave return_std= and n_samples= out."
             )
 

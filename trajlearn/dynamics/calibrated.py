@@ -67,7 +67,8 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
 
     The unit of calibration is the episode: one start in each, never several, since the errors of
     one episode go together. Bands at a level of 90 % need at least 9 calibration episodes that
-    reach a horizon, at 95 % 19; with fewer they are infinite, and `Forecast.interval` warns.
+    reach a horizon, at 95 % 19, and simultaneous ones twice as many; with fewer they are infinite,
+    and `Forecast.interval` warns.
 
     Parameters
     ----------
@@ -84,9 +85,11 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
         shape, the other half into their size.
     cv : float, int, splitter or iterable of (train, test), default=0.2
         A float: that share of whole episodes (of groups, where there are) is held out, and the
-        estimator fitted on the rest; then the coverage is guaranteed. Otherwise each episode is
-        forecast by an estimator fitted on the other folds, and the final one on all: no episode
-        is lost and the coverage is good in practice, but not guaranteed.
+        estimator fitted on the rest; then the coverage is guaranteed for episodes exchangeable
+        with those held out, which those of new groups are not if groups have several episodes.
+        Otherwise each episode is forecast by an estimator fitted on the other folds, and the
+        final one on all: no episode is lost and the coverage is good in practice, but not
+        guaranteed.
     start : int or "random", default=0
         Start of the forecast of each calibration episode; "random" draws one for each. Coverage
         is for forecasts that start alike.
@@ -120,9 +123,9 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
     calibration (other controllers, another battery), nothing is guaranteed; nor for forecasts by
     other actions than those of calibration, of which a warning speaks. A diverged forecast counts
     as an infinite error in the bands, and is left out of `rescaling_` and of the samples' noise.
-    Beyond the last step that calibration episodes reach, bands are infinite, and `std` keeps its
-    last factor with a `HorizonWarning`. States that were never logged, as velocities estimated by
-    a smoother, keep their `std`, and their bands are infinite.
+    Beyond the last step that calibration episodes reach, bands are infinite, and `std` keeps the
+    last factor and floor with a `HorizonWarning`. States that were never logged, as velocities
+    estimated by a smoother, keep their `std`, and their bands are infinite.
 
     `trajlearn.dynamics._conformal` says how the bands are made, with references.
 
@@ -142,6 +145,8 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
     >>> bool(np.mean((lower <= walks[80:, 1:]) & (walks[80:, 1:] <= upper)) > 0.8)
     True
     """
+
+    bands_: ConformalBands | None
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "estimator": [HasMethods(["fit", "predict"]), None],
@@ -218,6 +223,9 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
         if y is not None:
             raise ValueError("y must be omitted: the targets come from the episodes themselves.")
         ds = in_groups(_episodes(X), groups)
+        # if this fit fails, the calibration of an earlier one must not be taken for its own
+        if hasattr(self, "bands_"):
+            del self.bands_
         seed = check_random_state(self.random_state).randint(2**31, size=4)
         rng = np.random.default_rng(seed)
         self.estimator_, forecast, truth = fit_and_forecast(
@@ -309,7 +317,7 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
         CalibrationWarning
             If actions come from elsewhere than in calibration.
         """
-        check_is_fitted(self, "estimator_")
+        check_is_fitted(self, "bands_")
         uncertain = return_std or bool(n_samples)
         found = self.estimator_.predict(
             _episodes(X),
@@ -365,7 +373,7 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
         -------
         Forecast
         """
-        check_is_fitted(self, "estimator_")
+        check_is_fitted(self, "bands_")
         uncertain = return_std or bool(n_samples)
         found = self.estimator_.predict_trajectory(
             initial_states,

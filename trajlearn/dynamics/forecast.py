@@ -101,6 +101,8 @@ class Forecast:
         bands: NDArray[np.object_] | None = None,
         raw_std: Floats | None = None,
     ) -> None:
+        if bands is not None and raw_std is None:
+            raise ValueError("bands need raw_std, the standard deviation that they multiply.")
         self.mean, self.std, self.samples = mean, std, samples
         self.bands, self.raw_std = bands, raw_std
         self.times, self.horizons, self.lengths = times, horizons, lengths
@@ -218,7 +220,8 @@ class Forecast:
         -------
         lower, upper : ndarray of shape (n, H, d_s)
             Of the conformal bands if there are some; else quantiles of the samples, if there
-            are some; else Gaussian.
+            are some; else Gaussian. S samples reach no level above ``(S - 1) / (S + 1)``; beyond,
+            the interval is that of the outermost two.
 
         Warns
         -----
@@ -232,7 +235,8 @@ class Forecast:
         """
         if not 0 < level < 1:
             raise ValueError(f"level = {level} must lie between 0 and 1.")
-        if self.bands is not None and self.raw_std is not None:
+        if self.bands is not None:
+            assert self.raw_std is not None  # __init__ has checked
             width = half_widths(self.bands, level, self.raw_std, self.horizons, self.lengths)
             with np.errstate(invalid="ignore"):
                 return self.mean - width, self.mean + width
@@ -418,6 +422,8 @@ def concatenate(forecasts: Sequence[Forecast]) -> Forecast:
         if name != "times"
     }
     bands = [f.bands for f in forecasts if f.bands is not None]
+    if bands and len(bands) < len(forecasts):
+        raise ValueError("some of the forecasts have conformal bands and others have none.")
     low = np.min([f.state_range[0] for f in forecasts], axis=0)
     high = np.max([f.state_range[1] for f in forecasts], axis=0)
     return longest._replace(
@@ -427,6 +433,6 @@ def concatenate(forecasts: Sequence[Forecast]) -> Forecast:
         samples=joined("samples", axis=1),
         times=joined("times"),
         state_range=np.stack([low, high]),
-        bands=np.concatenate(bands) if len(bands) == len(forecasts) else None,
+        bands=np.concatenate(bands) if bands else None,
         **rest,
     )

@@ -1,6 +1,7 @@
 """Measures of calibration by horizon bin and state, resampled over episodes."""
 
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,7 @@ from scipy.stats import rankdata
 
 from trajlearn.evaluation._bootstrap import EpisodeBootstrap
 from trajlearn.evaluation._cells import Cells
+from trajlearn.exceptions import CalibrationWarning
 
 __all__ = ["LEVELS", "Measures"]
 
@@ -39,7 +41,8 @@ class Measures:
 
     def widths(self, levels: Sequence[float]) -> Iterator[Floats]:
         """Mean width of the interval of each level."""
-        return map(self.mean, self._cells.widths(levels))
+        for level in levels:
+            yield self.mean(_quietly(self._cells.widths, level))
 
     def crps(self) -> Floats:
         """Mean CRPS."""
@@ -55,8 +58,10 @@ class Measures:
 
     def calibration_error(self) -> Floats:
         """Mean distance between coverage and level over `LEVELS`."""
-        gaps = (np.abs(found - p) for p, found in zip(LEVELS, self.coverage(LEVELS)))
-        return sum(gaps, start=np.zeros(())) / len(LEVELS)
+        gap: Floats = np.zeros(())
+        for level in LEVELS:
+            gap = gap + np.abs(self.mean(_quietly(self._cells.hits, level)) - level)
+        return gap / len(LEVELS)
 
     def spread_skill(self, spread: Floats) -> Floats:
         """Root mean variance over root mean squared error; 0 where a cell has diverged."""
@@ -116,6 +121,13 @@ class Measures:
             reached = self.mean(inside)
             yield reached - below
             below = reached
+
+
+def _quietly(values: Callable[[Sequence[float]], Iterator[Floats]], level: float) -> Floats:
+    """Values of one level, without a word on bands of a level that nobody asked for (again)."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", CalibrationWarning)
+        return next(values([level]))
 
 
 def _ratio(part: Floats, whole: Floats) -> Floats:

@@ -22,7 +22,7 @@ def calibration_report(
     forecast: Forecast,
     truth: TrajectoryDataset,
     *,
-    levels: Sequence[float] = (0.5, 0.9, 0.95),
+    levels: Sequence[float] = (0.5, 0.9),
     bins: Bins = "standard",
     truth_kind: str = "observed",
     n_bootstrap: int = 200,
@@ -39,7 +39,7 @@ def calibration_report(
     truth : TrajectoryDataset or list of Trajectory
         The episodes that were forecast, in the same order. Where they have more states than the
         forecast, those of the same names are compared.
-    levels : sequence of float, default=(0.5, 0.9, 0.95)
+    levels : sequence of float, default=(0.5, 0.9)
         Probabilities that the intervals promise, each between 0 and 1.
     bins : {"standard"}, None or list of (first, last), default="standard"
         Horizons in steps, both included, whose cells count together: the standard bins are 1-5,
@@ -106,6 +106,10 @@ def calibration_report(
 
     Where the intervals are quantiles of S samples, they end at the outermost ones: no level above
     ``(S - 1) / (S + 1)`` is reached.
+
+    Widths and scores are in units of ``forecast.state_range``: those of two forecasts compare only
+    if it is the same. That of a `CalibratedForecaster` includes its calibration episodes; give it
+    to the forecast of the model inside: ``raw.state_range = model.state_range_``.
 
     Examples
     --------

@@ -27,7 +27,7 @@ def plot_fan(
     state: str | None = None,
     ax: "Axes | None" = None,
     *,
-    levels: Sequence[float] = (0.5, 0.9, 0.95),
+    levels: Sequence[float] = (0.5, 0.9),
     units: Mapping[str, str] | None = None,
 ) -> "Axes":
     """Fan chart: one state of one episode, with intervals of several levels.
@@ -44,7 +44,7 @@ def plot_fan(
         Default: the first that was forecast.
     ax : matplotlib Axes, optional
         Default: a new figure.
-    levels : sequence of float, default=(0.5, 0.9, 0.95)
+    levels : sequence of float, default=(0.5, 0.9)
         Probabilities inside the shaded intervals; the narrowest is darkest.
     units : mapping from name to unit, optional
         For the labels: of states, and of ``"time"``.
