@@ -196,9 +196,9 @@ class TwoDoorRegressor(SaveMixin, RegressorMixin, NestedDefaults):
             return self.scaler_.scaled(rows)
         return np.asarray(self.scaler_.transform(rows), dtype=np.float64)
 
-    def _moments(self) -> Moments:
+    def _moments(self, *, means_only: bool = False) -> Moments:
         """Function from raw rows to means and variances of the targets, by member."""
-        learner = moments_of(self.estimator_)
+        learner = moments_of(self.estimator_, means_only=means_only)
 
         def moments(rows: Floats) -> tuple[Floats, Floats | None]:
             means, variances = learner(self._scaled(rows))
@@ -215,7 +215,7 @@ class TwoDoorRegressor(SaveMixin, RegressorMixin, NestedDefaults):
         )
 
     def _predict_rows_of(self, rows: Floats, return_std: bool) -> Any:
-        means, variances = self._moments()(rows)
+        means, variances = self._moments(means_only=not return_std)(rows)
         mean = mean_of_members(means)
         shape = (slice(None), 0) if self._y_ndim == 1 else slice(None)
         if not return_std:

@@ -79,12 +79,18 @@ def spread(values: Floats, magnitude: Floats, weight: Floats | None) -> Floats:
     return np.where(std > least, std, np.maximum(np.abs(mean), least))
 
 
-def moments_of(learner: Any) -> Moments:
-    """Function from scaled rows (n, k) to means (E, n, d) and variances (E, n, d) or None."""
+def moments_of(learner: Any, *, means_only: bool = False) -> Moments:
+    """Function from scaled rows (n, k) to means (E, n, d) and variances (E, n, d) or None.
+
+    `means_only` leaves the variances out, which of some learners take longer than the means.
+    """
     if isinstance(learner, MLPEnsembleRegressor):
-        predictor = learner.predictor()
+        predictor = learner.predictor(means_only=means_only)
+        if means_only:
+            return lambda rows: (predictor(rows)[..., : len(learner.target_mean_)], None)
         return lambda rows: learner.moments(predictor(rows))
-    with_std = "return_std" in inspect.signature(learner.predict).parameters
+    can = "return_std" in inspect.signature(learner.predict).parameters
+    with_std = can and not means_only
 
     def moments(rows: Floats) -> tuple[Floats, Floats | None]:
         if not len(rows):

@@ -172,7 +172,7 @@ class OneStepRegressor(RollingEstimator):
 
     def _step(self, query: Query, copies: int, rng: np.random.Generator | None) -> Step:
         if rng is None:
-            return expected_step(self._moments())
+            return expected_step(self._moments(means_only=True))
         if self.propagation == "expectation":
             return drawn_step(self._full(self._moments()), rng)
         n_members = n_members_of(self.estimator_)

@@ -1,6 +1,5 @@
 """Trajectory-based models: the state after a horizon in one evaluation."""
 
-from functools import partial
 from numbers import Real
 from typing import Any, ClassVar
 
@@ -318,12 +317,12 @@ class TrajectoryRegressor(DynamicsEstimator):
         )
         if splits and ((horizons == longest) | ~query.known()).all():
             return self._at_split_rows(query, np.arange(n), longest[None], means_only)
-        at_some = partial(self._at_split_rows, means_only=means_only) if splits else self._at_rows
+        at_some = self._at_split_rows if splits else self._at_rows
         per_chunk = max(_CHUNK_ROWS // n_steps, 1)
         means, variances = [], []
         for at in range(0, n, per_chunk):
             some = np.arange(at, min(at + per_chunk, n))
-            mean, variance = at_some(query, some, horizons[some])
+            mean, variance = at_some(query, some, horizons[some], means_only)
             means.append(mean)
             if variance is not None:
                 variances.append(variance)
@@ -331,7 +330,7 @@ class TrajectoryRegressor(DynamicsEstimator):
         return np.concatenate(means, axis=1), joined
 
     def _at_rows(
-        self, query: Query, some: NDArray[np.intp], horizons: Floats
+        self, query: Query, some: NDArray[np.intp], horizons: Floats, means_only: bool
     ) -> tuple[Floats, Floats | None]:
         """Some starts at horizons (len(some), H) of their own, row by row."""
         n_steps = horizons.shape[1]
@@ -350,7 +349,7 @@ class TrajectoryRegressor(DynamicsEstimator):
             rows[:, self.layout_["references"]] = self.relabeler_.reference_rows(
                 ds, np.repeat(start, n_steps), end.ravel()
             )
-        means, variances = self._moments()(rows)
+        means, variances = self._moments(means_only=means_only)(rows)
         shape = (len(means), len(some), n_steps, means.shape[-1])
         return means.reshape(shape), None if variances is None else variances.reshape(shape)
 
