@@ -1,8 +1,5 @@
 """Real flights for a benchmark: groups, splits, starts, and errors in physical units."""
 
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,9 +7,9 @@ from numpy.typing import NDArray
 from sklearn.model_selection import GroupKFold
 
 from benchmarks.paper._command import data_folder
+from benchmarks.paper._rollouts import expected_warnings
 from trajlearn import BlockKFold, TrajectoryDataset, starts_every
 from trajlearn.datasets import load_crazyflie_gains
-from trajlearn.exceptions import DivergenceWarning, HorizonWarning
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -174,19 +171,10 @@ def tracking_errors(
 def predicted_states(model: Any, ds: TrajectoryDataset) -> Floats:
     """States (rows, d_s) predicted from the first start on, to the end of each flight."""
     first = np.array([some[0] for some in starts(ds)])
-    with quiet():
+    with expected_warnings():
         forecast = model.predict(ds, start=first)
     states = ds.states.copy()
     for i, (begin, n) in enumerate(zip(first, forecast.lengths, strict=True)):
         row = ds.offsets[i] + begin + 1
         states[row : row + n] = forecast.mean[i, :n]
     return states
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """No warnings of what the tables report."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DivergenceWarning)
-        warnings.simplefilter("ignore", HorizonWarning)
-        yield

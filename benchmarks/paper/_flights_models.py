@@ -12,13 +12,13 @@ from benchmarks.paper._flights_data import (
     flights,
     folds,
     predicted_states,
-    quiet,
     squared_errors,
     starts,
     tracking_errors,
     truth_at,
 )
 from benchmarks.paper._flights_kernel import GainsCurveForecaster, gain_scaler, linear_forecast
+from benchmarks.paper._rollouts import expected_warnings
 from trajlearn import (
     HoldForecaster,
     LSTMRegressor,
@@ -181,7 +181,7 @@ def cell(rows: list[str], split: str, fold: int, mode: str, seed: int) -> dict[s
 
 def forecast_at(model: Any, ds: TrajectoryDataset) -> Floats:
     """States (n, n_horizons, d_s) that a model predicts from every start; NaN beyond the logs."""
-    with quiet():
+    with expected_warnings():
         forecast = model.predict(ds, start=starts(ds), horizon=max(HORIZONS))
     states = np.full((len(forecast), max(HORIZONS), forecast.mean.shape[2]), np.nan)
     states[:, : forecast.mean.shape[1]] = forecast.mean

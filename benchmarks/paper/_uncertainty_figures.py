@@ -7,14 +7,16 @@ import pandas as pd
 
 from benchmarks.paper._command import Tables
 from benchmarks.paper._figures import legend_below
-from benchmarks.paper._uncertainty_page import TARGET, observed, place, steps
+from benchmarks.paper._uncertainty_tables import LOGGED, at, observed, place, steps
+from benchmarks.paper._uncertainty_target import TARGET
 from trajlearn.plotting._style import GREY, INK, line_style, tidy
 
 #: Models of the figures of all tasks; the others are in the tables.
 SHOWN = ["P", "PE", "T", "TP", "TPE", "LSTM", "GP, sparse"]
 #: Models of the figure of the paper, and of the growth.
-COMPARED = ["P, logged actions", "P", "PE", "TP", "T"]
-_MARKERS = "os^DvP*"
+COMPARED = [f"P, {LOGGED}", "P", "PE", "TP", "T"]
+_STYLED = [*SHOWN, f"P, {LOGGED}"]
+_MARKERS = "os^DvP*X"
 _UNITS = {"velocity": "rad/s", "x_dot": "m/s", "theta_dot": "rad/s", "x": "m", "theta": "rad"}
 
 
@@ -38,8 +40,10 @@ def _places(table: pd.DataFrame) -> list[tuple[str, float]]:
     return list(table[["task", "noise"]].drop_duplicates().itertuples(index=False, name=None))
 
 
-def _at(table: pd.DataFrame, task: str, noise: float) -> pd.DataFrame:
-    return table[(table["task"] == task) & (table["noise"] == noise)]
+def _look(model: str) -> dict[str, Any]:
+    """The style of a model in all figures."""
+    i = _STYLED.index(model)
+    return {"marker": _MARKERS[i], "mfc": "white"} | line_style(i)
 
 
 def _lines(
@@ -57,26 +61,22 @@ def _lines(
     bins = some[["first", "last"]].drop_duplicates().sort_values("first")
     x = np.arange(len(bins))
     models = [model for model in SHOWN if (some["model"] == model).any()]
-    for model in models:
-        i = SHOWN.index(model)
+    for i, model in enumerate(models):
         by = some[some["model"] == model].groupby("first")
         middle = by[column].mean().to_numpy() * unit
         ends = (column, column) if bars is None else bars
         low, high = by[ends[0]].min().to_numpy() * unit, by[ends[1]].max().to_numpy() * unit
-        shift = (i - (len(SHOWN) - 1) / 2) * 0.07
-        look = {"color": line_style(i)["color"], "ls": line_style(i)["linestyle"]}
+        shift = (i - (len(models) - 1) / 2) * 0.07
         ax.errorbar(
             x + shift,
             middle,
             # a bootstrap interval need not hold the mean
             yerr=np.maximum([middle - low, high - middle], 0.0),
-            marker=_MARKERS[i],
             ms=5,
-            mfc="white",
             lw=1.2,
             elinewidth=0.8,
             label=model,
-            **look,
+            **_look(model),
         )
     labels = [steps(first, last) for first, last in bins.itertuples(index=False)]
     ax.set_xticks(x, labels)
@@ -97,11 +97,13 @@ def _draw_coverage(main: pd.DataFrame) -> Any:
         len(places), 2, figsize=(9.5, 2.6 * len(places)), layout="constrained", squeeze=False
     )
     for axes, (task, noise) in zip(grid, places, strict=True):
-        some = _at(main, task, noise)
+        some = at(main, task, noise)
         for ax, kind in zip(axes, ("raw", "conformal"), strict=True):
             _target_band(ax)
-            _lines(ax, some[some["kind"] == kind], "coverage90")
-            ax.set_ylim(*((0.0, 1.02) if kind == "raw" else (0.78, 1.0)))
+            few = some[some["kind"] == kind]
+            _lines(ax, few, "coverage90")
+            least = few["coverage90"].min() - 0.01
+            ax.set_ylim(*((0.0, 1.02) if kind == "raw" else (min(0.78, least), 1.0)))
             ax.set_ylabel("coverage of 90 %")
             ax.set_title(f"{place(task, noise)}: {kind}", loc="left", fontsize=10)
     first = max(grid[:, 0], key=lambda ax: len(ax.get_legend_handles_labels()[1]))
@@ -120,10 +122,10 @@ def _draw_crps(main: pd.DataFrame) -> Any:
     for ax in grid.ravel()[len(places) :]:
         ax.set_visible(False)
     for ax, (task, noise) in zip(grid.ravel(), places, strict=False):
-        some = _at(main, task, noise)
+        some = at(main, task, noise)
         _lines(ax, some[some["kind"] == "conformal"], "crps", 1000)
         ax.set_yscale("log")
-        ax.set_ylabel("CRPS (range = 1000)")
+        ax.set_ylabel("CRPS x 1000\n(training ranges)")
         ax.set_title(f"{place(task, noise)}, calibrated", loc="left", fontsize=10)
     first = max(grid.ravel(), key=lambda ax: len(ax.get_legend_handles_labels()[1]))
     legend_below(figure, first, ncols=len(SHOWN))
@@ -146,38 +148,36 @@ def _draw_growth(growth: pd.DataFrame) -> Any:
         sharey="row",
     )
     for axes, (task, noise) in zip(grid, places, strict=True):
-        some = _at(growth, task, noise)
+        some = at(growth, task, noise)
         for ax, model in zip(axes, models, strict=True):
             few = some[some["model"] == model]
-            if few.empty:
-                ax.set_visible(False)
-                continue
-            for i, column in enumerate(("std", "error")):
-                by = few.groupby("horizon")[column]
-                look = line_style(i)
-                middle = by.median()
-                ax.plot(
-                    middle.index,
-                    middle,
-                    marker="os"[i],
-                    ms=3.5,
-                    lw=1.4,
-                    mfc="white",
-                    label={"std": "predicted std", "error": "error"}[column],
-                    **look,
-                )
-                ax.fill_between(
-                    middle.index, by.min(), by.max(), color=look["color"], alpha=0.15, lw=0
-                )
-            ax.set_xscale("log")
-            ax.set_yscale("log")
-            ax.set_title(model, loc="left", fontsize=9)
-            tidy(ax)
-        axes[0].set_ylabel(f"{place(task, noise)}\nrange = 1", fontsize=8)
-    for ax in grid[-1]:
-        ax.set_xlabel("horizon (steps)")
-    legend_below(figure, grid[0, 1], ncols=2)
+            ax.set_visible(len(few) > 0)
+            if len(few):
+                _draw_grown(ax, few)
+                ax.set_title(model, loc="left", fontsize=9)
+        axes[0].set_ylabel(f"{place(task, noise)}\n(training ranges)", fontsize=8)
+    for column in grid.T:
+        lowest = [ax for ax in column if ax.get_visible()][-1]
+        lowest.tick_params(labelbottom=True)
+        lowest.set_xlabel("horizon (steps)")
+    legend_below(figure, grid[0, 0], ncols=2)
     return figure
+
+
+def _draw_grown(ax: Any, few: pd.DataFrame) -> None:
+    # neither looks like a model
+    looks = {
+        "std": {"color": INK, "linestyle": "solid", "marker": "o", "label": "predicted std"},
+        "error": {"color": GREY, "linestyle": "dashed", "marker": "s", "label": "error"},
+    }
+    for column, look in looks.items():
+        by = few.groupby("horizon")[column]
+        middle = by.median()
+        ax.plot(middle.index, middle, ms=3.5, lw=1.4, mfc="white", **look)
+        ax.fill_between(middle.index, by.min(), by.max(), color=look["color"], alpha=0.15, lw=0)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    tidy(ax)
 
 
 def _draw_example(example: pd.DataFrame) -> Any:
@@ -210,9 +210,10 @@ def _draw_example(example: pd.DataFrame) -> Any:
                 color=GREY,
                 alpha=0.35,
                 lw=0,
-                label="mean +- 2 std",
+                label="mean ± 2 std",
             )
-            ax.plot(time, mean, color=line_style(0)["color"], lw=1.2, label="mean")
+            # its look is in the legend, from the standard deviations
+            ax.plot(time, mean, color=_look(model)["color"], lw=1.2)
             ax.plot(time, few["truth"], color=INK, lw=1.2, ls="dashed", label="simulated")
             ax.set_ylim(*limits)
             tidy(ax)
@@ -226,11 +227,9 @@ def _draw_example(example: pd.DataFrame) -> Any:
                 few["std"],
                 lw=1.3,
                 label=model,
-                marker=_MARKERS[i],
                 markevery=(5 + 7 * i, 40),
                 ms=4,
-                mfc="white",
-                **line_style(i),
+                **_look(model),
             )
         last.set_yscale("log")
         last.set_ylabel(f"std [{unit_of(state)}]", fontsize=8)
@@ -262,7 +261,7 @@ def _draw_flights(flights: pd.DataFrame) -> Any:
         ax.set_ylim(min(a.get_ylim()[0] for a in axes[:2]), 1.01)
     _lines(axes[2], flights[flights["kind"] == "conformal"], "crps", 1000)
     axes[2].set_yscale("log")
-    axes[2].set_ylabel("CRPS (range = 1000)")
+    axes[2].set_ylabel("CRPS x 1000 (training ranges)")
     axes[2].set_title("real flights, calibrated", loc="left", fontsize=10)
     legend_below(figure, axes[0], ncols=len(SHOWN))
     return figure

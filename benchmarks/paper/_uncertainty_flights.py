@@ -6,8 +6,9 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.paper._command import Run
-from benchmarks.paper._flights_data import N_FOLDS, flights, folds, quiet
+from benchmarks.paper._flights_data import N_FOLDS, flights, folds
 from benchmarks.paper._flights_models import build
+from benchmarks.paper._rollouts import expected_warnings
 from benchmarks.paper._uncertainty_scores import (
     LEVEL,
     bins_of,
@@ -24,7 +25,8 @@ from trajlearn.evaluation import interval_hits
 HORIZON, STRIDE, BEFORE = 200, 50, 1
 MODELS = {"full": ["P", "PE", "TPE", "T"], "quick": ["P", "T"]}
 SPLIT = "experiment"
-_PARTICLES = 20
+#: Particles behind the standard deviations of P and PE.
+PARTICLES = 20
 
 
 def estimator_of(model: str, mode: str, seed: int) -> Any:
@@ -32,7 +34,7 @@ def estimator_of(model: str, mode: str, seed: int) -> Any:
     if model in ("P", "PE"):
         estimator = build("D, logged actions, previous", mode, seed)
         return estimator.set_params(
-            n_particles=_PARTICLES,
+            n_particles=PARTICLES,
             estimator__probabilistic=True,
             estimator__n_members=1 if model == "P" else 5,
         )
@@ -71,7 +73,7 @@ def cell(model: str, fold: int, mode: str, seed: int) -> dict[str, Any]:
     """
     train, calibration, test = parts(fold)
     estimator = estimator_of(model, mode, seed).fit(train)
-    with quiet():
+    with expected_warnings():
         raw = {
             name: estimator.predict(ds, start=BEFORE, return_std=True, random_state=seed)
             for name, ds in (("calibration", calibration), ("test", test))
@@ -116,7 +118,11 @@ def cells_of(run: Run) -> list[dict[str, Any]]:
 
 
 def _scores(results: list[tuple[dict[str, Any], dict[str, Any]]]) -> pd.DataFrame:
-    """Means over folds by the number of pieces; the interval draws experiments anew."""
+    """Means over folds by the number of pieces; the interval draws experiments anew.
+
+    Columns ``n_groups`` (experiments tested in all folds) and ``groups_of_fold`` (mean over the
+    folds, each of which calibrates another one).
+    """
     lines = [
         pd.DataFrame(result["scores"]).assign(
             model=asked["model"], seed=asked["seed"], fold=asked["fold"]
@@ -130,9 +136,13 @@ def _scores(results: list[tuple[dict[str, Any], dict[str, Any]]]) -> pd.DataFram
     pooled = by[["n_episodes", "n_diverged"]].sum()
     for measure in measures:
         weighted = table[measure] * table["n_episodes"]
-        pooled[measure] = weighted.groupby([table[key] for key in keys], sort=False).sum()
-        pooled[measure] /= pooled["n_episodes"]
-    pooled = pooled.reset_index()
+        total = weighted.groupby([table[key] for key in keys], sort=False)
+        # what has no value in one fold has none at all
+        pooled[measure] = total.agg(lambda some: some.sum(skipna=False)) / pooled["n_episodes"]
+    groups = {asked["fold"]: set(result["group"]) for asked, result in results}
+    n_groups = len(set().union(*groups.values()))
+    of_fold = np.mean([len(some) for some in groups.values()])
+    pooled = pooled.reset_index().assign(n_groups=n_groups, groups_of_fold=of_fold)
     found = {key: bounds(*some) for key, some in _inside(results).items()}
     index = {bin_: i for i, bin_ in enumerate(bins_of(HORIZON))}
     own = [
@@ -177,6 +187,7 @@ def settings(mode: str) -> dict[str, Any]:
         "horizon": HORIZON,
         "stride": STRIDE,
         "level": LEVEL,
+        "n_particles": PARTICLES,
         "models": {
             model: " ".join(str(estimator_of(model, mode, 0)).split()) for model in MODELS[mode]
         },

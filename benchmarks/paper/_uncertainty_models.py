@@ -8,8 +8,10 @@ from trajlearn import GPRegressor, OneStepRegressor, TransitionRelabeler
 
 #: Rows behind an exact Gaussian process; the sparse one takes all.
 GP_ROWS = 800
-_SPARSE = {"n_inducing": 100, "max_fit_rows": 1500}
-_PARTICLES = {"full": 20, "quick": 10}
+GP_SPARSE = {"n_inducing": 100, "max_fit_rows": 1500}
+#: Particles behind a standard deviation that is sampled; a Gaussian process has `GP_PARTICLES`.
+PARTICLES = {"full": 20, "quick": 10}
+GP_PARTICLES = 10
 #: Episodes for calibration and test, of the forecasts that have all of them.
 CALIBRATION = {"full": 200, "quick": 60}
 TEST = {"full": 1000, "quick": 100}
@@ -43,6 +45,13 @@ class Variant:
         n, m = CALIBRATION[mode], TEST[mode]
         return (n, m) if self.most is None else (min(n, self.most), min(m, self.most))
 
+    def particles(self, mode: str) -> int | None:
+        """Particles behind a standard deviation; None where no particles are drawn."""
+        sampled = self.name.startswith(("P", "GP", "LSTM"))
+        if not sampled or self.parameters.get("propagation") in ("moment", "unscented"):
+            return None
+        return int(self.parameters.get("n_particles", PARTICLES[mode]))
+
 
 #: What each fit is asked for: all variants of one entry share it.
 VARIANTS = {
@@ -57,9 +66,9 @@ VARIANTS = {
         Variant("PE, moment", {"propagation": "moment"}, most=100),
         Variant("PE, unscented", {"propagation": "unscented"}, most=100),
     ],
-    "GP, exact": [Variant("GP, exact", {"n_particles": 10}, most=20)],
+    "GP, exact": [Variant("GP, exact", {"n_particles": GP_PARTICLES}, most=20)],
     "GP, sparse": [
-        Variant("GP, sparse", {"n_particles": 10}, most=100),
+        Variant("GP, sparse", {"n_particles": GP_PARTICLES}, most=100),
         # the exact moments take time in proportion to the inducing points and states, squared
         Variant("GP, sparse, moment", {"propagation": "moment"}, most=40, task="cartpole"),
     ],
@@ -75,13 +84,24 @@ QUICK = ["P", "PE", "LSTM", "TP", "T"]
 SMALL = ["PE", "T"]
 #: How the models are called in text.
 DESCRIPTIONS = {
-    "P": "one network with a Gaussian output, rolled out with recomputed actions (TSinf)",
-    "PE": "an ensemble of five of them",
-    "GP, exact": f"a Gaussian process of one step on {GP_ROWS} rows",
-    "GP, sparse": f"the same on all rows, with {_SPARSE['n_inducing']} inducing points",
-    "LSTM": "a recurrent network with a Gaussian output",
-    "TP": "one trajectory network trained on the likelihood alone, as in the paper",
-    "TPE": "an ensemble of five trajectory networks, trained on the beta-likelihood",
+    "P": "one network of one step with a Gaussian output, trained on the beta-likelihood (beta "
+    "0.5); particles (TSinf), actions recomputed by the policy",
+    "P, logged actions": "the same fit; it replays the actions of the log, which a planner would "
+    "not know",
+    "PE": "an ensemble of five such networks",
+    "PE, logged actions": "the same fit, replaying the log",
+    "PE, ts1": "the same fit, as are the next three: particles that draw a member at every step",
+    "PE, expectation": "particles that draw from one Gaussian of all members",
+    "PE, moment": "a Gaussian a member, propagated by the slopes of the step",
+    "PE, unscented": "a Gaussian a member, propagated by sigma points",
+    "GP, exact": f"a Gaussian process of one step on {GP_ROWS:,} rows",
+    "GP, sparse": f"the same with {GP_SPARSE['n_inducing']} inducing points on all rows, its "
+    f"hyper-parameters found on {GP_SPARSE['max_fit_rows']:,} of them",
+    "GP, sparse, moment": "the same fit with the exact moments instead of particles",
+    "LSTM": "a recurrent network with a Gaussian output, trained on the beta-likelihood (beta 0.5)",
+    "TP": "one trajectory network trained on the plain likelihood, as in the paper",
+    "TPE": "an ensemble of five trajectory networks, trained on the beta-likelihood (beta 0.5): "
+    "it differs from TP in the likelihood, too",
     "T": "one trajectory network trained on the squared error, and a second one for the variance "
     "of its residuals",
 }
@@ -92,17 +112,17 @@ def estimator_of(fit: str, policy: Any, *, mode: str, seed: int) -> Any:
     if fit.startswith("GP"):
         exact = "exact" in fit
         learner = GPRegressor(
-            max_exact=GP_ROWS, n_restarts=0, max_iter=50, **({} if exact else _SPARSE)
+            max_exact=GP_ROWS, n_restarts=0, max_iter=50, **({} if exact else GP_SPARSE)
         )
         rows = TransitionRelabeler(max_rows=GP_ROWS if exact else None)
         return OneStepRegressor(learner, relabeler=rows, policy=policy, random_state=seed)
     if fit == "LSTM":
         model = build("LSTM", "default", policy=policy, mode=mode, seed=seed)
-        return model.set_params(probabilistic=True, n_particles=_PARTICLES[mode])
+        return model.set_params(probabilistic=True, n_particles=PARTICLES[mode])
     if fit.startswith("P"):
         model = build("PE", "default", policy=policy, mode=mode, seed=seed)
         members = 1 if fit == "P" else 5
-        return model.set_params(n_particles=_PARTICLES[mode], estimator__n_members=members)
+        return model.set_params(n_particles=PARTICLES[mode], estimator__n_members=members)
     model = build("T", "default", policy=policy, mode=mode, seed=seed)
     if mode == "quick":
         # beside the mean, a variance has to be learnt

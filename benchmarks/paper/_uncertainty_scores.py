@@ -11,6 +11,7 @@ from sklearn.frozen import FrozenEstimator
 
 from trajlearn import CalibratedForecaster, Forecast, TrajectoryDataset, calibration_report
 from trajlearn.evaluation import crps, energy_scores, interval_hits
+from trajlearn.evaluation._bootstrap import horizon_bins
 
 Floats = NDArray[np.float64]
 
@@ -28,8 +29,6 @@ MEASURES = (
     "error_std_correlation",
     "energy_score",
 )
-# last steps of the standard bins but the last
-_ENDS = (5, 25, 75, 150)
 _N_RESAMPLES, _TAIL = 500, 0.025
 # episodes forecast at once: particles of all would not fit into memory
 _CHUNK = 100
@@ -99,19 +98,12 @@ def forecasts_ids(*parts: TrajectoryDataset) -> list[Any]:
     return ids
 
 
-def scores(
-    forecast: Forecast,
-    truth: TrajectoryDataset,
-    *,
-    n_bootstrap: int = 0,
-) -> list[dict[str, Any]]:
+def scores(forecast: Forecast, truth: TrajectoryDataset) -> list[dict[str, Any]]:
     """A line a bin of horizons, pooled over the states."""
     with warnings.catch_warnings():
         # infinite scores of what diverged are the result, not a surprise
         warnings.simplefilter("ignore", RuntimeWarning)
-        report = calibration_report(
-            forecast, truth, levels=LEVELS, n_bootstrap=n_bootstrap, random_state=0
-        )
+        report = calibration_report(forecast, truth, levels=LEVELS, n_bootstrap=0)
     report = report[report["state"] == "all"]
     return [_line(some) for _, some in report.groupby(["first", "last"], sort=True)]
 
@@ -136,9 +128,7 @@ def _coverage(level: float) -> str:
 
 def brief(forecast: Forecast, truth: TrajectoryDataset) -> list[dict[str, Any]]:
     """The coverage and the CRPS of `scores` alone, which take a tenth of the time."""
-    values = {
-        f"coverage{100 * level:.0f}": interval_hits(forecast, truth, level) for level in LEVELS
-    }
+    values = {_coverage(level): interval_hits(forecast, truth, level) for level in LEVELS}
     values["crps"] = crps(forecast, truth)
     episodes = {"n_episodes": len(forecast), "n_diverged": int((forecast.diverged_at > 0).sum())}
     low, high = bounds(by_episode(values[_coverage(LEVEL)]), np.arange(len(forecast)))
@@ -151,8 +141,8 @@ def brief(forecast: Forecast, truth: TrajectoryDataset) -> list[dict[str, Any]]:
 
 def bins_of(n_steps: int) -> list[tuple[int, int]]:
     """Standard bins of the report of calibration, as far as a forecast goes."""
-    ends = [last for last in _ENDS if last < n_steps] + [n_steps]
-    return list(zip([1, *(last + 1 for last in ends[:-1])], ends, strict=True))
+    found = horizon_bins(np.arange(1, n_steps + 1), "standard")
+    return [(some.first, some.last) for some in found]
 
 
 def by_episode(hits: Floats) -> Floats:

@@ -11,6 +11,8 @@ from benchmarks.paper._rollouts import expected_warnings
 from benchmarks.paper._tasks import N_EPISODES, environment
 from benchmarks.paper._uncertainty_models import (
     CALIBRATION,
+    GP_ROWS,
+    GP_SPARSE,
     SMALL,
     TEST,
     VARIANTS,
@@ -235,6 +237,15 @@ def settings(mode: str) -> dict[str, Any]:
         "length": LENGTH[mode],
         "noise": "measurement noise in standard deviations of each state, on all episodes",
         "level": LEVEL,
-        "variants": {fit: [v.name for v in some] for fit, some in VARIANTS.items()},
+        "variants": {
+            fit: [_facts(variant, mode) for variant in some] for fit, some in VARIANTS.items()
+        },
+        "gaussian_processes": {"rows_of_the_exact_one": GP_ROWS, "sparse": GP_SPARSE},
         "small_sets": SMALL_SETS,
     }
+
+
+def _facts(variant: Variant, mode: str) -> dict[str, Any]:
+    n_calibration, n_test = variant.sizes(mode)
+    facts = {"name": variant.name, "n_calibration": n_calibration, "n_test": n_test}
+    return facts | {"n_particles": variant.particles(mode), "only_on": variant.task}

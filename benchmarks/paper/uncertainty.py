@@ -14,6 +14,7 @@ without it the report names what was not run.
 """
 
 import sys
+from collections import Counter
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -26,7 +27,7 @@ from benchmarks.paper._command import Benchmark, Run, Tables
 from benchmarks.paper._flights_data import FOLDER
 from benchmarks.paper._tasks import QUADROTOR, TASKS
 from benchmarks.paper._uncertainty_figures import draw
-from benchmarks.paper._uncertainty_models import FLYING, QUICK, VARIANTS
+from benchmarks.paper._uncertainty_models import FLYING, QUICK, VARIANTS, Variant
 from benchmarks.paper._uncertainty_page import report
 
 #: Measurement noise in standard deviations of each state, and more of it.
@@ -88,7 +89,7 @@ def _cell(
 
 
 def run(run: Run, *, more: bool = False) -> Tables:
-    """Scores, growth, whole trajectories, the example, and what was run."""
+    """Scores, those behind small sets, growth, whole trajectories, the example, what was run."""
     cells = core(run.mode, run.seeds) + (optional(run.mode, run.seeds) if more else [])
     tables: dict[str, list[pd.DataFrame]] = {
         name: [] for name in ("scores", "growth", "whole", "samples", "seconds")
@@ -101,13 +102,21 @@ def run(run: Run, *, more: bool = False) -> Tables:
                 if some[table]:
                     tables[table].append(pd.DataFrame([key | line for line in some[table]]))
             seconds = {"fit": result["fit_seconds"], "forecast": some["seconds"]}
+            seconds["n_particles"] = _variant(asked["fit"], name).particles(run.mode)
             tables["seconds"].append(pd.DataFrame([key | seconds]))
     flown = real.run_flights(run)
     done = {name: pd.concat(some, ignore_index=True) for name, some in tables.items()}
+    of_set = done["scores"]["kind"] == "set"
+    done["sets"] = done["scores"][of_set].dropna(axis="columns", how="all")
+    done["scores"] = done["scores"][~of_set].dropna(axis="columns", how="all")
     done["example"] = _example(run)
     if flown is not None:
         done |= {"flights": flown[0], "flights-growth": flown[1]}
     return done | {"parts": _parts(run, more=more, flown=flown is not None)}
+
+
+def _variant(fit: str, name: str) -> Variant:
+    return next(variant for variant in VARIANTS[fit] if variant.name == name)
 
 
 def task_name(cell: dict[str, Any]) -> str:
@@ -137,19 +146,30 @@ def _example(run: Run) -> pd.DataFrame:
 
 
 def _parts(run: Run, *, more: bool, flown: bool) -> pd.DataFrame:
-    """What there is to run, and whether it was."""
-    counts: dict[tuple[str, float, bool], int] = {}
-    for cells, ran in ((core(run.mode, run.seeds), True), (optional(run.mode, run.seeds), more)):
-        for cell in cells:
-            key = (task_name(cell), cell["noise"], ran)
-            counts[key] = counts.get(key, 0) + 1
-    n_real = len(real.cells_of(run))
-    counts["real flights", 0.0, flown] = n_real
+    """What there is to run, and what it needs: nothing, if it was run."""
+    done = core(run.mode, run.seeds) + (optional(run.mode, run.seeds) if more else [])
+    ran = {_work(cell) for cell in done}
+    rest = [cell for cell in core("full", run.seeds) if _work(cell) not in ran]
+    extra = [cell for cell in optional("full", run.seeds) if _work(cell) not in ran]
+    parts = [("nothing", done), ("full", rest), ("more", extra)]
+    counts = Counter(
+        (task_name(cell), cell["noise"], needs) for needs, cells in parts for cell in cells
+    )
+    flights = len(real.cells_of(run))
+    counts["real flights", 0.0, "nothing" if flown else "data"] = flights
+    left_out = len(real.cells_of(replace(run, mode="full"))) - flights
+    if left_out:
+        counts["real flights", 0.0, "full"] = left_out
     lines = [
-        {"task": task, "noise": noise, "cells": n, "run": ran}
-        for (task, noise, ran), n in counts.items()
+        {"task": task, "noise": noise, "cells": n, "needs": needs}
+        for (task, noise, needs), n in counts.items()
     ]
     return pd.DataFrame(lines)
+
+
+def _work(cell: dict[str, Any]) -> tuple[Any, ...]:
+    """What a cell does in any mode."""
+    return tuple(value for name, value in cell.items() if name != "mode")
 
 
 def settings(mode: str) -> dict[str, Any]:
@@ -162,7 +182,7 @@ def settings(mode: str) -> dict[str, Any]:
 
 
 BENCHMARK = Benchmark(
-    "uncertainty", __doc__, run, report, draw, settings, minutes=60, data=(FOLDER,)
+    "uncertainty", __doc__, run, report, draw, settings, minutes=110, data=(FOLDER,)
 )
 
 

@@ -9,10 +9,13 @@ from benchmarks.paper import (
     _models,
     _tasks,
     _uncertainty_flights,
+    _uncertainty_growth,
     _uncertainty_models,
     _uncertainty_page,
     _uncertainty_scores,
     _uncertainty_simulated,
+    _uncertainty_tables,
+    _uncertainty_target,
     uncertainty,
 )
 from benchmarks.paper._command import Run, read_tables
@@ -35,7 +38,7 @@ def small(monkeypatch):
     monkeypatch.setitem(_uncertainty_simulated.LENGTH, "quick", LENGTH)
     monkeypatch.setitem(_uncertainty_models.CALIBRATION, "quick", N_CALIBRATION)
     monkeypatch.setitem(_uncertainty_models.TEST, "quick", N_TEST)
-    monkeypatch.setitem(_uncertainty_models._PARTICLES, "quick", 3)
+    monkeypatch.setitem(_uncertainty_models.PARTICLES, "quick", 3)
     monkeypatch.setattr(_uncertainty_models, "QUICK_STEPS", 5)
     monkeypatch.setattr(_models, "QUICK_STEPS", 10)
     monkeypatch.setattr(_uncertainty_simulated, "N_SAMPLED", 4)
@@ -219,6 +222,14 @@ def test_every_estimator_is_what_its_name_says():
     assert of("LSTM")["probabilistic"] is True
     assert of("GP, exact")["relabeler__max_rows"] == _uncertainty_models.GP_ROWS
     assert of("GP, sparse")["relabeler__max_rows"] is None
+    for fit, variants in _uncertainty_models.VARIANTS.items():
+        model = _uncertainty_models.estimator_of(fit, None, mode="full", seed=0)
+        for variant in variants:
+            parameters = model.set_params(**variant.parameters).get_params()
+            drawn = parameters.get("propagation", "tsinf") not in ("moment", "unscented")
+            expected = parameters.get("n_particles") if drawn else None
+            assert variant.particles("full") == expected
+        assert {variant.name for variant in variants} <= set(_uncertainty_models.DESCRIPTIONS)
     propagated = {
         v.parameters["propagation"] for v in _uncertainty_models.VARIANTS["PE, propagated"]
     }
@@ -256,8 +267,10 @@ def test_the_run_gives_tables_that_text_and_figures_come_from(small, monkeypatch
     assert "flights" not in tables
     text = uncertainty.report(tables)
     assert "### cartpole, 3 % noise" in text
-    assert "Not run: real flights (2 cells)." in text
-    assert "`--data FOLDER`" in text
+    assert "recorded flights (`--data FOLDER`): real flights (2 cells)." in text
+    assert "fewer steps: reacher, 3 % noise (9 cells); cartpole, 3 % noise (7 cells);" in text
+    assert "GP, sparse, moment" not in text
+    assert "3 particles (P; P, logged actions)" in text
     assert "| cartpole, 3 % noise | T | 20 |" in text
     example = tables["example"]
     assert set(example["model"]) == {"P", "P, logged actions", "T"}
@@ -269,62 +282,164 @@ def test_the_run_gives_tables_that_text_and_figures_come_from(small, monkeypatch
 # -- text -----------------------------------------------------------------------------------------
 
 
-def scores_of(covered, crps=(10.0, 10.0), model="P", n_episodes=1000):
+def scores_of(covered, crps=(10.0, 10.0), nll=(0.0, 0.0), model="P", n_episodes=1000):
     """Made-up scores: raw, then conformal with these coverages, one a seed."""
     return pd.DataFrame(
         [
             {"task": "reacher", "noise": 0.0, "model": model, "seed": seed, "kind": kind}
             | {"truth": "observed", "n_calibration": 200, "first": 1, "last": 5}
-            | {"coverage90": value if kind == "conformal" else 0.5, "crps": score, "nll": 0.0}
+            | {"coverage90": value if kind == "conformal" else 0.5, "crps": score, "nll": of_nll}
             | {"n_episodes": n_episodes, "n_diverged": 0}
-            for kind, score in zip(("raw", "conformal"), crps, strict=True)
+            for kind, score, of_nll in zip(("raw", "conformal"), crps, nll, strict=True)
             for seed, value in enumerate(covered)
         ]
     )
 
 
+def target_of(*scores):
+    """Line of each size in the table of the target, and the exceptions."""
+    lines = _uncertainty_target.target(pd.concat(scores))
+    rows = [line.strip("| ").split(" | ") for line in lines[2].split("\n")[2:]]
+    return {row[0]: row[1:5] for row in rows}, "\n".join(lines[4:])
+
+
 @pytest.mark.parametrize(
-    ("covered", "crps", "said"),
+    ("covered", "crps", "nll", "met", "said"),
     [
-        ([0.87, 0.91], (10.0, 10.2), ["in 1 of 1 cells", "in 1 of 1."]),
-        ([0.87, 0.88], (10.0, 10.0), ["in 0 of 1 cells", "P (1-5: 0.875)"]),
-        ([0.9, 0.9], (10.0, 10.3), ["in 1 of 1 cells", "in 0 of 1.", "P (1-5: 1.03)"]),
+        ([0.87, 0.91], (10.0, 10.2), (1.0, 0.9), (1, 1, 1), ""),
+        ([0.87, 0.88], (10.0, 10.0), (0.0, 0.0), (0, 1, 1), "P (1-5: 0.875)"),
+        ([0.9, 0.9], (10.0, 10.3), (-1.0, -1.0), (1, 0, 1), "P (1-5: 1.03)"),
+        ([0.9, 0.9], (10.0, 10.0), (-1.0, -0.8), (1, 1, 0), "P (1-5: +0.2)"),
         # nothing that diverged is called cheap
-        ([0.9, 0.9], (INF, INF), ["in 0 of 1.", "P (1-5: nan)"]),
+        ([0.9, 0.9], (INF, INF), (INF, INF), (1, 0, 0), "P (1-5: infinite before and after)"),
     ],
 )
-def test_the_target_is_checked_on_the_mean_over_seeds(covered, crps, said):
-    text = "\n".join(_uncertainty_page.target(scores_of(covered, crps)))
-    for part in said:
-        assert part in text
+def test_the_target_is_checked_on_the_mean_over_seeds(covered, crps, nll, met, said):
+    rows, exceptions = target_of(scores_of(covered, crps, nll))
+    ((inside, alone, cheap, no_worse),) = rows.values()
+    assert (inside, cheap, no_worse) == tuple(f"{n} of 1" for n in met)
+    assert alone == f"{sum(0.88 <= value <= 0.92 for value in covered)} of 2"
+    assert said in exceptions
 
 
 def test_forecasts_of_fewer_episodes_are_counted_apart():
     few = scores_of([0.8, 0.8], model="GP", n_episodes=20)
-    text = _uncertainty_page.target(pd.concat([scores_of([0.9, 0.9]), few]))
-    assert "in 1 of 1 cells" in text[0]
-    assert text[1].startswith("- Forecasts of fewer test episodes")
-    assert "in 0 of 1 cells" in text[1]
+    rows, _ = target_of(scores_of([0.9, 0.9]), few)
+    assert [row[0] for row in rows.values()] == ["1 of 1", "0 of 1"]
+    assert list(rows) == ["200 / 1000", "200 / 20"]
+
+
+def test_chance_is_that_of_exchangeable_residuals():
+    rng = np.random.default_rng(0)
+    # exactly valid: the 46th of 50 residuals is the half width, rank ceil(51 * 0.9)
+    bound = np.sort(rng.uniform(size=(20_000, 50)), axis=1)[:, 45]
+    covered = (rng.uniform(size=(20_000, 40)) < bound[:, None]).mean(axis=1)
+    found = _uncertainty_target.chance(50, 40, 2)
+    assert found.std == pytest.approx(covered.std(), rel=0.03)
+    inside = [
+        ((some >= 0.88 - 1e-9) & (some <= 0.92 + 1e-9)).mean()
+        for some in (covered, covered.reshape(-1, 2).mean(axis=1))
+    ]
+    assert (found.one, found.several) == pytest.approx(inside, abs=0.015)
+    assert _uncertainty_target.chance(5, 40, 2).one == 0.0
+
+
+def test_few_particles_of_a_perfect_model_cover_less():
+    rng = np.random.default_rng(0)
+    particles, truth = rng.normal(size=(100_000, 10)), rng.normal(size=100_000)
+    inside = np.abs(truth) <= 1.6449 * particles.std(axis=1)
+    assert _uncertainty_target.perfect_coverage(10) == pytest.approx(inside.mean(), abs=0.005)
+    assert _uncertainty_target.perfect_coverage(10**6) == pytest.approx(0.9, abs=1e-4)
 
 
 def test_the_sharpest_model_is_named_by_its_calibrated_score():
-    scores = pd.concat([scores_of([0.9], (1.0, 8e-3)), scores_of([0.9], (1e-3, 9e-3), model="T")])
-    assert "steps 1-5: P (8) before T (9)" in _uncertainty_page.sharpest(scores)
+    scores = [scores_of([0.9], (1.0, 8e-3)), scores_of([0.9], (1e-3, 9e-3), model="T")]
+    # they know more, or less was asked of them
+    scores.append(scores_of([0.9], (1.0, 1e-3), model="P, logged actions"))
+    scores.append(scores_of([0.9], (1.0, 1e-3), model="GP", n_episodes=20))
+    assert "1-5: P (8) before T (9)." in _uncertainty_tables.sharpest(pd.concat(scores))
+    scores.append(scores_of([0.9], (1.0, 8.01e-3), model="PE"))
+    assert "1-5: P and PE equal (8)." in _uncertainty_tables.sharpest(pd.concat(scores))
+    (lost,) = [scores_of([0.9], (INF, INF))]
+    assert "1-5: all are infinite." in _uncertainty_tables.sharpest(lost)
+
+
+def test_divergence_is_counted_over_all_seeds():
+    scores = pd.concat([scores_of([0.9, 0.9, 0.9]), scores_of([0.9, 0.9, 0.9], model="T")])
+    assert _uncertainty_tables.diverged(scores) == []
+    scores.loc[(scores["seed"] == 1) & (scores["model"] == "T"), "n_diverged"] = 3
+    (_, line) = _uncertainty_tables.diverged(scores)
+    assert line.endswith("T: 3 of 3000.")
+
+
+def test_quality_shows_the_range_over_bins_and_hides_nothing():
+    scores = pd.concat([scores_of([0.9, 0.9]).assign(first=f, last=f + 4) for f in (1, 6)])
+    scores = scores.assign(spread_skill=np.where(scores["first"] == 1, 0.5, 2.0))
+    scores = scores.assign(error_std_correlation=0.5, calibration_error=[np.nan, *[0.1] * 7])
+    raw, conformal = _uncertainty_page._quality(scores).to_dict("records")
+    assert raw["spread / error"] == "0.5 to 2"
+    assert raw["calibration error"].startswith("nan")
+    assert conformal["calibration error"] == "0.1 (0.1 to 0.1)"
+
+
+def test_small_sets_have_their_interval_and_range():
+    sets = scores_of([0.8, 0.9]).assign(kind="set", n_calibration=20, low=[0.7, 0.8] * 2, high=0.95)
+    text = "\n".join(_uncertainty_page._small(sets[2:]))
+    assert "| P | 20 | 0.85 [0.75, 0.95] (0.8 to 0.9) |" in text
+
+
+# -- growth ---------------------------------------------------------------------------------------
+
+
+def growth_of(*ends, model="P", task="reacher"):
+    """Growth with this std and error at 10 and 200 steps, in each of three seeds."""
+    return pd.DataFrame(
+        [
+            {"task": task, "noise": 0.03, "model": model, "seed": seed, "horizon": h}
+            | {"std": std, "error": error}
+            for seed in range(3)
+            for h, (std, error) in zip((10, 200), ends, strict=True)
+        ]
+    )
 
 
 def test_growth_tells_an_explosion_from_an_error():
-    growth = pd.DataFrame(
-        [
-            {"task": "reacher", "noise": 0.03, "model": "P", "seed": seed, "horizon": h}
-            | {"std": std, "error": error}
-            for seed in range(3)
-            for h, std, error in ((10, 0.01, 0.01), (200, 1.0, 0.02))
-        ]
+    (line,) = _uncertainty_growth.growth_table(growth_of((0.01, 0.01), (1.0, 0.02))).to_dict(
+        "records"
     )
-    (line,) = _uncertainty_page.growth_table(growth).to_dict("records")
     assert line["std x (10 to 200)"] == "100"
     assert line["error x"] == "2"
     assert (line["std / error at 10"], line["std / error at 200"]) == ("1", "50")
+
+
+def test_the_verdict_follows_from_the_growth_by_rule():
+    small = (0.01, 0.01)
+    growth = pd.concat(
+        [
+            growth_of(small, (1.0, 0.02)),
+            growth_of(small, (0.2, 0.11), model="PE"),
+            growth_of(small, (1.0, 0.9), model="P, logged actions"),
+            growth_of(small, (0.01, 0.021), model="T"),
+            growth_of(small, (INF, INF), model="TP"),
+            growth_of(small, (9.0, 9.0), model="LSTM"),
+            growth_of(small, (1.0, 1.0), task="real"),
+        ]
+    )
+    lines = _uncertainty_growth.verdict(growth)
+    assert lines[-2:] == [
+        "- reacher, 3 % noise (10 to 200): std grows faster than the error: P (x 100, error x 2); "
+        "std grows with the error: PE (x 20, error x 11), P, logged actions (x 100, error x 90); "
+        "std grows more slowly than the error: T (x 1, error x 2.1); "
+        "diverged: TP (diverged, error diverged).",
+        "- real flights (10 to 200): std grows with the error: P (x 100, error x 100).",
+    ]
+    rows = [line.strip("| ").split(" | ") for line in lines[2].split("\n")[2:]]
+    # forecasts, std explodes, the error too; faster, with, more slowly, diverged
+    assert {row[0]: "".join(row[1:]) for row in rows} == {
+        "one-step, logged actions": "2220200",
+        "one-step, actions recomputed": "2211100",
+        "trajectory": "2110011",
+    }
 
 
 # -- real flights ---------------------------------------------------------------------------------
@@ -361,10 +476,22 @@ def test_folds_of_real_flights_are_pooled():
     assert raw["crps"].tolist() == [2.0] * 5
     assert raw["n_episodes"].tolist() == [4] * 5
     assert raw["low"].tolist() == raw["high"].tolist() == [0.5] * 5
+    assert raw["n_groups"].tolist() == [4] * 5
     text = "\n".join(_uncertainty_page._flights(table))
     assert "0.9 [0.9, 0.9]" in text
+    assert text.startswith("4 pieces of 4 experiments: forecasts of 200 steps, one every 50")
+    assert "about 2 experiments" in text
     figure = uncertainty.draw.__globals__["_draw_flights"](table)
     assert len(figure.axes) == 3
+
+
+def test_what_has_no_value_in_one_fold_has_none_at_all():
+    results = flight_results()
+    results[0][1]["scores"][0]["crps"] = np.nan
+    results[0][1]["scores"][1]["crps"] = INF
+    table = _uncertainty_flights._scores(results)
+    first = table[(table["kind"] == "raw") & (table["seed"] == 0)]["crps"]
+    np.testing.assert_array_equal(first, [np.nan, INF, 2.0, 2.0, 2.0])
 
 
 @pytest.mark.data
