@@ -35,7 +35,7 @@ a claim if the interval, where there is one, and every seed agree, and is open o
 all comparisons speak for the claim. *Holds only if*: there are conditions under which all do; they
 are named. *Fails*: there are none, and something speaks against it. *Open*: neither.
 
-Not audited here: the quadrotors, uncertainty, and control.
+Not audited here: control, and uncertainty, which has [its own page](uncertainty.md).
 """
 
 
