@@ -1,19 +1,12 @@
 """What calibration learns from: the residuals of held-out episodes, and how they scale."""
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from trajlearn.dynamics._shared_states import shared_states
-from trajlearn.trajectories import TrajectoryDataset
-
-if TYPE_CHECKING:
-    from trajlearn.dynamics.forecast import Forecast
-
-__all__ = ["Rescaling", "Residuals", "crps_rescaling", "residuals_of"]
+__all__ = ["Rescaling", "Residuals", "crps_rescaling"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -96,27 +89,6 @@ class Residuals:
         """Last step that enough episodes reach without divergence; 0 if none does."""
         count = self.usable.any(axis=2).sum(axis=0)
         return int(np.flatnonzero(count >= min(_ENOUGH, max(count.max(), 1))).max(initial=-1)) + 1
-
-
-def residuals_of(forecast: "Forecast", truth: TrajectoryDataset, std: Floats) -> Residuals:
-    """Residuals of one forecast an episode; episodes and steps that nobody logged are left out.
-
-    Parameters
-    ----------
-    forecast : Forecast
-    truth : TrajectoryDataset
-        Its n episodes. A state of the forecast that was never logged has no residuals.
-    std : ndarray of shape (n, H, d_s)
-        Predicted standard deviations, positive.
-    """
-    errors = np.full(forecast.mean.shape, np.nan)
-    columns, _, _ = shared_states(forecast.state_names, truth)
-    errors[..., columns] = forecast.residuals(truth)
-    elapsed = forecast.times - forecast.initial_times[:, None]
-    logged = ~np.isnan(errors).all(axis=2)
-    rows, steps = np.flatnonzero(logged.any(axis=1)), np.flatnonzero(logged.any(axis=0))
-    n_steps = steps.max(initial=-1) + 1
-    return Residuals(errors[:, :n_steps], std[:, :n_steps], elapsed[:, :n_steps])[rows]
 
 
 def crps_rescaling(residuals: Residuals) -> Rescaling:

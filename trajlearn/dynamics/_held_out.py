@@ -1,4 +1,4 @@
-"""Forecasts of episodes by models that were not fitted on them, for calibration."""
+"""Forecasts of episodes by models that were not fitted on them, and their residuals."""
 
 import warnings
 from collections.abc import Iterator
@@ -12,13 +12,16 @@ from sklearn.base import clone
 from sklearn.frozen import FrozenEstimator
 from sklearn.model_selection import GroupKFold, GroupShuffleSplit, check_cv
 
+from trajlearn.dynamics._calibration import Residuals
 from trajlearn.dynamics._learner import seeded
+from trajlearn.dynamics._shared_states import shared_states
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.exceptions import CalibrationWarning, NoUncertaintyError
 from trajlearn.trajectories import TrajectoryDataset
 
-__all__ = ["fit_and_forecast", "in_groups", "splits"]
+__all__ = ["fit_and_forecast", "in_groups", "residuals_of", "splits"]
 
+Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 
@@ -161,3 +164,24 @@ def _forecast(
             "dynamics estimator, or a Pipeline that ends in one."
         )
     return forecast, ds
+
+
+def residuals_of(forecast: Forecast, truth: TrajectoryDataset, std: Floats) -> Residuals:
+    """Residuals of one forecast an episode; episodes and steps that nobody logged are left out.
+
+    Parameters
+    ----------
+    forecast : Forecast
+    truth : TrajectoryDataset
+        Its n episodes. A state of the forecast that was never logged has no residuals.
+    std : ndarray of shape (n, H, d_s)
+        Predicted standard deviations, positive.
+    """
+    errors = np.full(forecast.mean.shape, np.nan)
+    columns, _, _ = shared_states(forecast.state_names, truth)
+    errors[..., columns] = forecast.residuals(truth)
+    elapsed = forecast.times - forecast.initial_times[:, None]
+    logged = ~np.isnan(errors).all(axis=2)
+    rows, steps = np.flatnonzero(logged.any(axis=1)), np.flatnonzero(logged.any(axis=0))
+    n_steps = steps.max(initial=-1) + 1
+    return Residuals(errors[:, :n_steps], std[:, :n_steps], elapsed[:, :n_steps])[rows]

@@ -14,7 +14,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._persistence import SaveMixin
 from trajlearn._sklearn import HasMethods, Interval, StrOptions, fit_context
-from trajlearn.dynamics._calibration import Residuals, crps_rescaling, residuals_of
+from trajlearn.dynamics._calibration import Residuals, crps_rescaling
 from trajlearn.dynamics._conformal import (
     ConformalBands,
     marginal_bands,
@@ -22,7 +22,7 @@ from trajlearn.dynamics._conformal import (
     steps_of,
 )
 from trajlearn.dynamics._forecaster import Forecaster
-from trajlearn.dynamics._held_out import fit_and_forecast, in_groups
+from trajlearn.dynamics._held_out import fit_and_forecast, in_groups, residuals_of
 from trajlearn.dynamics._nested_defaults import NestedDefaults
 from trajlearn.dynamics._residual_paths import ResidualPaths, residual_paths
 from trajlearn.dynamics._shared_states import shared_states
