@@ -226,7 +226,7 @@ def negative_log_likelihood(
 def energy_scores(forecast: Forecast, truth: TrajectoryDataset) -> Floats:
     """Energy score: the CRPS of the joint state, of samples.
 
-    E |X - y| - E |X - X'| / 2 with Euclidean distances between states in training ranges; the
+    ``E |X - y| - E |X - X'| / 2`` with Euclidean distances of states in training ranges; the
     fair estimate, as in `crps`. It sees correlations between states that scores of single states
     do not.
 
