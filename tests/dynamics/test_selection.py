@@ -260,3 +260,24 @@ def test_parameters_of_the_wrong_kind_are_refused(Model, wrong, ds):
 def test_values_out_of_bounds_are_refused(model, name, ds):
     with pytest.raises(ValueError, match=f"'{name}' parameter"):
         model.fit(ds)
+
+
+class Dear(LinearRegression):
+    """A learner whose standard deviation nobody may ask for in vain."""
+
+    def predict(self, X, return_std=False):
+        if return_std:
+            raise AssertionError("asked for a standard deviation that is not needed")
+        return super().predict(X)
+
+
+def test_a_mean_roll_out_asks_for_no_standard_deviation(ds):
+    model = OneStepRegressor(Dear(), random_state=0).fit(ds)
+    assert np.isfinite(model.predict(ds, horizon=3).mean).all()
+
+
+def test_rows_without_return_std_ask_for_no_standard_deviation(ds):
+    first = ds.offsets[:-1]
+    rows = np.hstack([ds.states[first], np.ones((len(ds), 1))])  # one step ahead
+    model = TrajectoryRegressor(Dear(), random_state=0).fit(rows, ds.states[first + 1])
+    assert np.isfinite(model.predict(rows)).all()

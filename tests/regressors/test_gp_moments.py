@@ -4,7 +4,7 @@ from numpy.testing import assert_allclose
 from sklearn.exceptions import NotFittedError
 
 from trajlearn.regressors import _gp_moments
-from trajlearn.regressors._gp_moments import GaussianMoments, gaussian_moments, noise_variance
+from trajlearn.regressors._gp_moments import GaussianMoments, noise_variance
 from trajlearn.regressors.gp import GPRegressor
 
 
@@ -63,7 +63,7 @@ def weighted(gp, x, mass):
 def test_one_input_agrees_with_quadrature(sparse, std):
     gp = fitted(1, sparse=sparse)
     mean, covariance = np.array([[1.4], [-0.2]]), np.full((2, 1, 1), std**2)
-    found = gaussian_moments(gp, mean, covariance)
+    found = GaussianMoments(gp)(mean, covariance)
     for i in range(2):
         exact = by_quadrature(gp, mean[i], covariance[i], n=150)
         for ours, theirs in zip(found, exact):
@@ -73,7 +73,7 @@ def test_one_input_agrees_with_quadrature(sparse, std):
 def test_correlated_inputs_agree_with_quadrature(plane):
     mean = np.array([[1.0, 2.0], [5.0, -3.0]])
     covariance = np.array([[[1.0, 0.7], [0.7, 2.0]], [[4.0, -1.5], [-1.5, 1.0]]])
-    found = gaussian_moments(plane, mean, covariance)
+    found = GaussianMoments(plane)(mean, covariance)
     assert (np.abs(found[1][:, 0, 1]) > 0.02).all()  # the outputs do covary
     for i in range(2):
         for ours, theirs in zip(found, by_quadrature(plane, mean[i], covariance[i])):
@@ -88,7 +88,7 @@ def test_singular_covariance_agrees_with_monte_carlo():
     root = np.sqrt(np.diag(covariance[0])) * np.sign(covariance[0, 0])
     assert_allclose(np.outer(root, root), covariance[0])
     x = 1.0 + rng.normal(size=(n, 1)) * root
-    mean, spread, cross = gaussian_moments(gp, np.ones((1, 3)), covariance)
+    mean, spread, cross = GaussianMoments(gp)(np.ones((1, 3)), covariance)
     f, std = gp.predict(x, return_std=True)
     own = std**2 - noise_variance(gp)
     centred = f - mean[0]
@@ -104,7 +104,7 @@ def test_singular_covariance_agrees_with_monte_carlo():
 
 def test_a_known_input_is_a_plain_prediction(plane):
     x = np.random.default_rng(0).uniform(-8, 10, size=(70, 2))
-    mean, spread, cross = gaussian_moments(plane, x, np.zeros((70, 2, 2)))
+    mean, spread, cross = GaussianMoments(plane)(x, np.zeros((70, 2, 2)))
     predicted, std = plane.predict(x, return_std=True)
     assert_allclose(mean, predicted, rtol=1e-10)
     total = np.diagonal(spread, axis1=1, axis2=2) + noise_variance(plane)
@@ -120,7 +120,7 @@ def test_a_little_spread_goes_through_the_slope(plane, std):
     shape = np.array([[1.0, 0.4], [0.4, 2.0]])
     slope = np.stack([plane.predict(x + step * e) - plane.predict(x - step * e) for e in np.eye(2)])
     slope = slope[:, 0] / (2 * step)
-    _, spread, cross = gaussian_moments(plane, x, std**2 * shape[None])
+    _, spread, cross = GaussianMoments(plane)(x, std**2 * shape[None])
     assert_allclose(cross[0] / std**2, shape @ slope, rtol=1e-5)
     assert_allclose(spread[0, 0, 1] / std**2, (slope.T @ shape @ slope)[0, 1], rtol=1e-4)
 
@@ -130,7 +130,7 @@ def test_a_linear_function_maps_moments_linearly():
     X, slope = rng.normal(size=(80, 3)), np.array([[1.0, -2.0], [0.5, 0.0], [0.0, 3.0]])
     gp = GPRegressor(n_restarts=0, random_state=0).fit(X, X @ slope + 7.0)
     mean, covariance = np.array([[0.1, -0.3, 0.2]]), semi_definite(rng, 1, 3, scale=0.3)
-    found = gaussian_moments(gp, mean, covariance)
+    found = GaussianMoments(gp)(mean, covariance)
     assert_allclose(found[0], mean @ slope + 7.0, rtol=1e-3)
     assert_allclose(found[1][0], slope.T @ covariance[0] @ slope, rtol=5e-3, atol=1e-3)
     assert_allclose(found[2][0], covariance[0] @ slope, rtol=5e-3, atol=1e-3)
@@ -141,7 +141,7 @@ def test_a_1d_target_has_one_output():
     rng = np.random.default_rng(0)
     X = rng.uniform(-1, 1, size=(30, 1))
     gp = GPRegressor(n_restarts=0, random_state=0).fit(X, np.sin(3 * X[:, 0]))
-    found = gaussian_moments(gp, [[0.2]], [[[0.01]]])
+    found = GaussianMoments(gp)([[0.2]], [[[0.01]]])
     assert [values.shape for values in found] == [(1, 1), (1, 1, 1), (1, 1, 1)]
     for ours, theirs in zip(found, by_quadrature(gp, np.array([0.2]), np.array([[0.01]]))):
         assert_allclose(ours[0], theirs, rtol=1e-6, atol=1e-9)
@@ -167,9 +167,9 @@ def test_an_input_gets_the_same_bits_in_any_batch(plane):
 def test_the_size_of_the_tiles_changes_nothing_but_round_off(plane, monkeypatch):
     rng = np.random.default_rng(0)
     args = rng.normal(size=(3, 2)), semi_definite(rng, 3, 2)
-    whole = gaussian_moments(plane, *args)
+    whole = GaussianMoments(plane)(*args)
     monkeypatch.setattr(_gp_moments, "_TILE", 100)
-    for ours, tiled in zip(whole, gaussian_moments(plane, *args)):
+    for ours, tiled in zip(whole, GaussianMoments(plane)(*args)):
         assert_allclose(tiled, ours, rtol=1e-9, atol=1e-12)
 
 
@@ -179,7 +179,7 @@ def test_covariances_are_semi_definite(rank, scale):
     gp = fitted(3)
     rng = np.random.default_rng(2)
     covariance = semi_definite(rng, 20, 3, rank=rank, scale=scale)
-    mean, spread, cross = gaussian_moments(gp, rng.normal(size=(20, 3)), covariance)
+    mean, spread, cross = GaussianMoments(gp)(rng.normal(size=(20, 3)), covariance)
     assert np.isfinite(mean).all()
     assert np.isfinite(cross).all()
     np.testing.assert_array_equal(spread, spread.transpose(0, 2, 1))
@@ -198,7 +198,7 @@ def test_round_off_leaves_no_negative_eigenvalue():
 @pytest.mark.parametrize("std", [0.0, 0.1, 1.0])
 def test_far_from_the_data_is_the_prior(plane, distance, std):
     with np.errstate(over="raise", invalid="raise"):
-        mean, spread, cross = gaussian_moments(plane, [[distance] * 2], std * np.eye(2)[None])
+        mean, spread, cross = GaussianMoments(plane)([[distance] * 2], std * np.eye(2)[None])
     assert_allclose(mean[0], plane.target_mean_)
     assert_allclose(spread[0], np.diag(plane.signal_std_**2), rtol=1e-12)
     assert_allclose(cross, 0.0, atol=1e-100)
@@ -207,8 +207,8 @@ def test_far_from_the_data_is_the_prior(plane, distance, std):
 def test_all_inputs_between_near_and_far_are_finite_and_smooth(plane):
     # kernels underflow and excesses overflow somewhere on the way out
     far = np.geomspace(1.0, 1e4, 400)
-    mean, spread, _ = gaussian_moments(
-        plane, np.column_stack([far, far]), np.broadcast_to(np.eye(2), (400, 2, 2))
+    mean, spread, _ = GaussianMoments(plane)(
+        np.column_stack([far, far]), np.broadcast_to(np.eye(2), (400, 2, 2))
     )
     assert np.isfinite(mean).all()
     variance = np.diagonal(spread, axis1=1, axis2=2)
@@ -223,12 +223,12 @@ def test_other_kernels_are_refused():
     X = np.linspace(0, 1, 8)[:, None]
     gp = GPRegressor(kernel="matern52", n_restarts=0, max_iter=50, random_state=0).fit(X, X[:, 0])
     with pytest.raises(ValueError, match='kernel = "matern52"'):
-        gaussian_moments(gp, [[0.5]], [[[0.1]]])
+        GaussianMoments(gp)([[0.5]], [[[0.1]]])
 
 
 def test_an_unfitted_gp_is_refused():
     with pytest.raises(NotFittedError):
-        gaussian_moments(GPRegressor(), [[0.5]], [[[0.1]]])
+        GaussianMoments(GPRegressor())
     with pytest.raises(NotFittedError):
         noise_variance(GPRegressor())
 
@@ -247,4 +247,4 @@ def test_an_unfitted_gp_is_refused():
 )
 def test_bad_inputs_are_refused(plane, mean, covariance, message):
     with pytest.raises(ValueError, match=message):
-        gaussian_moments(plane, mean, covariance)
+        GaussianMoments(plane)(mean, covariance)

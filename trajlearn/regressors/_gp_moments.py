@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_is_fitted
 
 from trajlearn.regressors._gp_models import Floats
-from trajlearn.regressors._gp_posterior import BLOCK, _Explained
+from trajlearn.regressors._gp_posterior import BLOCK, Explained
 from trajlearn.regressors._threads import threads_for
 from trajlearn.regressors.gp import GPRegressor
 
-__all__ = ["GaussianMoments", "gaussian_moments", "noise_variance"]
+__all__ = ["GaussianMoments", "noise_variance"]
 
 # elements of a matrix of excesses that are held at once: they stay in the processor's cache
 _TILE = 131_072
@@ -36,41 +36,6 @@ _FAR, _WIDE = 1e10, 1e10
 
 # negative eigenvalues of a covariance, in shares of the greatest, that are taken for round-off
 _ROUND_OFF = 1e-6
-
-
-def gaussian_moments(
-    gp: GPRegressor, mean: ArrayLike, covariance: ArrayLike
-) -> tuple[Floats, Floats, Floats]:
-    """Moments of f(x) at Gaussian inputs x, in the units of the data.
-
-    For several calls with one GP keep a `GaussianMoments`: preparing it takes time in proportion
-    to the cube of the basis, each input to its square.
-
-    Parameters
-    ----------
-    gp : GPRegressor
-        Fitted with ``kernel="rbf"``.
-    mean : array-like of shape (m, k)
-    covariance : array-like of shape (m, k, k)
-        Symmetric and positive semi-definite; zero for an input that is known.
-
-    Returns
-    -------
-    mean : ndarray of shape (m, d)
-        Expectation of f(x); d is 1 for a GP fitted to a 1-D y.
-    covariance : ndarray of shape (m, d, d)
-        Of f(x): what follows from the spread of x and the GP's own uncertainty about f, without
-        the noise of an observation (`noise_variance`). Symmetric, positive semi-definite.
-    cross : ndarray of shape (m, k, d)
-        Covariance of x and f(x).
-
-    Raises
-    ------
-    ValueError
-        If the kernel is not "rbf", a shape is wrong, a value is not finite, or a covariance is
-        not symmetric and positive semi-definite.
-    """
-    return GaussianMoments(gp)(mean, covariance)
 
 
 def noise_variance(gp: GPRegressor) -> Floats:
@@ -109,7 +74,30 @@ class GaussianMoments:
             self._outputs = [_output(gp, i) for i in range(len(gp.weights_))]
 
     def __call__(self, mean: ArrayLike, covariance: ArrayLike) -> tuple[Floats, Floats, Floats]:
-        """Moments as of `gaussian_moments`."""
+        """Moments of f(x) at Gaussian inputs x, in the units of the data.
+
+        Parameters
+        ----------
+        mean : array-like of shape (m, k)
+        covariance : array-like of shape (m, k, k)
+            Symmetric and positive semi-definite; zero for an input that is known.
+
+        Returns
+        -------
+        mean : ndarray of shape (m, d)
+            Expectation of f(x); d is 1 for a GP fitted to a 1-D y.
+        covariance : ndarray of shape (m, d, d)
+            Of f(x): what follows from the spread of x and the GP's own uncertainty about f, without
+            the noise of an observation (`noise_variance`). Symmetric, positive semi-definite.
+        cross : ndarray of shape (m, k, d)
+            Covariance of x and f(x).
+
+        Raises
+        ------
+        ValueError
+            If a shape is wrong, a value is not finite, or a covariance is
+            not symmetric and positive semi-definite.
+        """
         gp = self._gp
         mu, s = _standardised(gp, mean, covariance)
         m, k, d = len(mu), gp.n_features_in_, len(self._outputs)
@@ -147,7 +135,7 @@ class _Output:
     signal: float
     basis: Floats  # (n, k)
     weights: Floats  # (n,)
-    explained: _Explained
+    explained: Explained
     # products of weights minus the inverse covariance of the basis; below the diagonal zero,
     # above it doubled
     products: torch.Tensor
@@ -160,7 +148,7 @@ def _output(gp: GPRegressor, i: int) -> _Output:
     products = np.outer(weights, weights) - root.T @ root
     upper = torch.tensor(np.triu(products) + np.triu(products, 1))
     precision = h.length_scales**-2.0
-    return _Output(precision, h.signal_variance, basis, weights, _Explained(root), upper)
+    return _Output(precision, h.signal_variance, basis, weights, Explained(root), upper)
 
 
 class _Expected(NamedTuple):

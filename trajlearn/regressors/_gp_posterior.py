@@ -111,7 +111,7 @@ def predict_rows(
     """
     mean = np.empty(len(rows))
     variance = None if root is None else np.empty(len(rows))
-    explained = None if root is None else _Explained(root)
+    explained = None if root is None else Explained(root)
     with threads_for(0.0):
         for at in range(0, len(rows), BLOCK):
             here = slice(at, at + BLOCK)
@@ -122,7 +122,7 @@ def predict_rows(
     return mean, None if variance is None else np.maximum(variance, 0.0)
 
 
-class _Explained:
+class Explained:
     """``|root k|^2`` for the rows k of a block.
 
     The bits of a matrix product may depend on where in memory its rows lie and on their place

@@ -75,8 +75,7 @@ class GaussianNLL:
 
     def gradient(self, out: Tensor, y: Tensor, weight: Tensor | None) -> Tensor:
         mean, raw = out.chunk(2, dim=2)
-        upper = self.max_logvar - softplus(self.max_logvar - raw)
-        logvar = self.min_logvar + softplus(upper - self.min_logvar)
+        upper, logvar = _clamped(raw, self.min_logvar, self.max_logvar)
         precision = torch.exp(-logvar)
         error = mean - y
         scale = torch.exp(self.beta * logvar) / y[0].numel()
@@ -114,8 +113,7 @@ class ResidualNLL:
         return []
 
     def gradient(self, out: Tensor, y: Tensor, weight: Tensor | None) -> Tensor:
-        upper = self.high - softplus(self.high - out)
-        logvar = self.low + softplus(upper - self.low)
+        upper, logvar = _clamped(out, self.low, self.high)
         grad = 1.0 - y**2 * torch.exp(-logvar)
         grad *= torch.sigmoid(self.high - out) * torch.sigmoid(upper - self.low)
         grad *= 0.5 / y[0].numel()
@@ -133,5 +131,10 @@ def _fill(parameter: Tensor, gradient: Tensor) -> None:
 
 def bounded(raw: Tensor, low: Tensor, high: Tensor) -> Tensor:
     """Smooth clamp of a raw log variance."""
+    return _clamped(raw, low, high)[1]
+
+
+def _clamped(raw: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+    """Clamped from above alone, and from both sides; gradients need the first, too."""
     upper = high - softplus(high - raw)
-    return low + softplus(upper - low)
+    return upper, low + softplus(upper - low)
