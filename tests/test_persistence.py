@@ -6,6 +6,7 @@ import struct
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
+from sklearn.base import clone
 from sklearn.ensemble import RandomForestRegressor
 from sklearn.linear_model import LinearRegression
 from sklearn.preprocessing import (
@@ -174,6 +175,17 @@ def test_functions_are_stored_by_name_and_given_again(ds, path):
     again = load(path, callables={"gain_policy": gain_policy})
     assert again.predict(ds).actions == "policy"
     np.testing.assert_array_equal(again.predict(ds).mean, model.predict(ds).mean)
+
+
+def test_bounds_that_are_an_array_survive(ds, path):
+    bounds = np.array([[-1.0, 2.0], [-3.0, 4.0]])
+    model = clone(t(scaler__param_bounds=bounds)).fit(ds)
+    model.save(path)
+    again = load(path)
+    np.testing.assert_array_equal(again.scaler.param_bounds, bounds)
+    np.testing.assert_array_equal(again.predict(ds).mean, model.predict(ds).mean)
+    assert not np.array_equal(again.predict(ds).mean, t().fit(ds).predict(ds).mean)
+    np.testing.assert_array_equal(clone(again).fit(ds).predict(ds).mean, model.predict(ds).mean)
 
 
 def test_features_are_stored_by_name_and_given_again(ds, path):

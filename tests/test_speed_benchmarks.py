@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from benchmarks.speed import _command, _gemm, _mbrl, _timing, predict, relabel, train_step
+from benchmarks.speed import _command, _gemm, _mbrl, _timing, plan, predict, relabel, train_step
 
 TINY = {
     train_step: train_step.Effort(rows=16, rounds=2, batch_sizes=(8,), members=(1, 2)),
     predict: predict.Effort(rounds=2, fit_steps=5, candidates=(2,), n_steps=20),
+    plan: plan.Effort(rounds=2, fit_steps=5, candidates=(5,), n_steps=20),
     relabel: relabel.Effort(rounds=2, n_rows=50, episodes=3, steps=(12,)),
 }
 BENCHMARKS = [pytest.param(module, id=module.NAME) for module in TINY]
@@ -110,6 +111,20 @@ def test_predictor_cases_compute_the_same(monkeypatch):
     few = by_name["T, every 10th horizon"]()
     assert np.allclose(few.mean, full.mean[:, 9:], atol=1e-9)
     assert by_name["one-step roll-out, 5 members"]().actions == "policy"
+
+
+def test_planning_cases_decide_among_as_many_candidates():
+    planners = plan._Planners(fit_steps=5, n_steps=20)
+    cases = planners.cases(70)
+    assert cases[0].name == "bare GEMM"
+    plans = {case.name: case.run() for case in cases[1:]}
+    assert {found.n_candidates for found in plans.values()} == {70}
+    whole, part = plans["T over policies"], plans["T over policies, every 10th step"]
+    assert whole.params.shape == (4,)
+    assert part.value != whole.value
+    assert plans["one-step over actions"].actions.shape == (20, 1)
+    assert {case.goal for case in cases} == {""}
+    assert [case.goal for case in planners.cases(1000)] == ["", "1.3x", "0.43x", "", "", ""]
 
 
 def test_measure_interleaves_and_compares_within_a_round(monkeypatch):

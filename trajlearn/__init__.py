@@ -9,6 +9,7 @@ from trajlearn._version import __version__
 _MODULE_OF = {
     "EpisodeRelabeler": "trajectories",
     "KalmanSmoother": "trajectories",
+    "ParamsTransformer": "trajectories",
     "StateSpaceModel": "trajectories",
     "SubtrajectoryRelabeler": "trajectories",
     "Trajectory": "trajectories",
@@ -21,6 +22,7 @@ _MODULE_OF = {
     "CurveForecaster": "dynamics",
     "DirectRewardGP": "dynamics",
     "DirectRewardNN": "dynamics",
+    "DistilledForecaster": "dynamics",
     "Forecast": "dynamics",
     "HoldForecaster": "dynamics",
     "HorizonFeatures": "dynamics",
@@ -36,6 +38,7 @@ _MODULE_OF = {
     "Quadrotor": "envs",
     "Reacher": "envs",
     "LinearFeedback": "policies",
+    "NetworkPolicy": "policies",
     "PID": "policies",
     "load_crazyflie_gains": "datasets",
     "load_nanobench_trefoil": "datasets",
@@ -52,6 +55,11 @@ _MODULE_OF = {
     "state_errors": "evaluation",
     "summarise": "evaluation",
     "trust_horizon": "evaluation",
+    "BayesianSearch": "control",
+    "MPC": "control",
+    "PolicySearch": "control",
+    "PredictedReturn": "control",
+    "RandomSearch": "control",
     "load": "_persistence",
     "plot_coverage": "plotting",
     "plot_fan": "plotting",
@@ -60,6 +68,8 @@ _MODULE_OF = {
     "plot_pit": "plotting",
     "plot_reliability": "plotting",
     "plot_reward_table": "plotting",
+    "plot_search": "plotting",
+    "plot_slices": "plotting",
     "check_dynamics_estimator": "testing",
     "CalibrationWarning": "exceptions",
     "DivergenceWarning": "exceptions",
@@ -70,6 +80,7 @@ _MODULE_OF = {
     "NoUncertaintyError": "exceptions",
     "SmoothingWarning": "exceptions",
     "UnknownFileError": "exceptions",
+    "UnsafeProposalError": "exceptions",
 }
 
 __all__ = ["__version__", *_MODULE_OF]

@@ -13,6 +13,7 @@ __all__ = [
     "NoUncertaintyError",
     "SmoothingWarning",
     "UnknownFileError",
+    "UnsafeProposalError",
 ]
 
 
@@ -34,6 +35,10 @@ class UnknownFileError(ValueError):
 
 class NoUncertaintyError(ValueError):
     """An estimator was asked for a standard deviation or samples that it cannot give."""
+
+
+class UnsafeProposalError(ValueError):
+    """A policy search found no parameters that are likely enough to keep the constraint."""
 
 
 class CalibrationWarning(UserWarning):

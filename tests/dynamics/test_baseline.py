@@ -575,3 +575,19 @@ def test_the_previous_action_has_to_be_known():
     assert np.isfinite(model.predict(silent).mean).all()
     with pytest.raises(MissingFieldError, match="before the start"):
         model.predict(silent, start=3)
+
+
+def test_a_trajectory_model_as_baseline_keeps_the_knots():
+    ds = tracking(shift=False)
+    inner = small().fit(ds)
+    model = small(baseline=FrozenEstimator(inner)).fit(ds)
+    asked = []
+
+    def reference(t):
+        asked.append(t)
+        return np.sin(2 * t)[:, None]
+
+    known = {"params": [1.0], "context": {"kind": "a"}, "phase": 0.0, "horizons": [1.0]}
+    model.predict_trajectory([0.5], references=reference, **known)
+    # one far horizon, but three times on the way to it
+    np.testing.assert_allclose(np.unique(np.concatenate(asked)), [0, 0.25, 0.5, 0.75, 1.0])

@@ -124,6 +124,45 @@ def test_bad_slots_are_refused():
         HorizonFeatures(n_scales=-1).fit(rows())
 
 
+# -- bounds of params -----------------------------------------------------------------------
+
+BOUNDS = [[4.0, 12.0], [-1.0, 0.0]]
+
+
+def test_bounds_map_params_to_minus_1_and_1_whatever_the_data():
+    X, ends = rows(), rows()[:2]
+    X[:, 4] = 7.0  # one theta in the log: its column is constant
+    ends[:, 4:6] = np.transpose(BOUNDS)
+    scaler = BlockScaler(param_bounds=BOUNDS, features=error).fit(X, layout=LAYOUT)
+    where = scaler.block_columns_["params"]
+    np.testing.assert_allclose(scaler.transform(ends)[:, where], [[-1, -1], [1, 1]])
+    np.testing.assert_allclose(scaler.transform(X)[:, where[0]], 2 * (7 - 4) / 8 - 1)
+    plain = BlockScaler(features=error).fit(X, layout=LAYOUT)
+    np.testing.assert_allclose(
+        np.delete(scaler.transform(X), where, axis=1), np.delete(plain.transform(X), where, axis=1)
+    )
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"param_bounds": [[0, 1]]}, r"\(1, 2\), and the rows hold 2 params"),
+        ({"param_bounds": [[0, 1], [2, 2]]}, "each lower bound below"),
+        ({"param_bounds": [[0, 1], [2, np.inf]]}, "must be finite"),
+        ({"param_bounds": [[1, 0], [0, 1]]}, "each lower bound below"),
+        ({"param_bounds": BOUNDS, "params": MinMaxScaler()}, "give one"),
+    ],
+)
+def test_bad_bounds_are_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        BlockScaler(**settings).fit(rows(), layout=LAYOUT)
+
+
+def test_bounds_need_params():
+    with pytest.raises(ValueError, match=r"hold 0 params.*among its inputs"):
+        BlockScaler(param_bounds=BOUNDS).fit(rows()[:, :2], layout={"state": slice(0, 2)})
+
+
 # -- features of state and params -----------------------------------------------------------
 
 

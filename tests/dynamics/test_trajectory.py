@@ -520,3 +520,16 @@ def test_seeds_reach_learners_inside_learners():
     first, second = (np.asarray(model.fit(ds).predict(ds)) for _ in range(2))
     np.testing.assert_array_equal(first, second)
     assert inner.random_state is None
+
+
+def test_dt_is_the_median_step_of_training():
+    times = [np.array([0, 3, 4, 5.0]), np.array([0, 1, 5.0])]
+    ds = TrajectoryDataset.from_arrays([np.ones((4, 1)), np.ones((3, 1))], times=times)
+    assert small().fit(ds).dt_ == 1.0
+    rows = np.random.default_rng(0).normal(size=(9, 2)) ** 2
+    assert small().fit(rows, rows[:, 0]).dt_ is None
+
+
+def test_dt_has_no_round_off():
+    ds = TrajectoryDataset.from_arrays(np.ones((1, 500, 1)), dt=0.02)
+    assert small().fit(ds).dt_ == 0.02

@@ -1,5 +1,6 @@
 """Formulations of dynamics: relabel, scale, learn, forecast."""
 
+from trajlearn.dynamics._differentiable import differentiable
 from trajlearn.dynamics.baselines import (
     CurveForecaster,
     HoldForecaster,
@@ -8,6 +9,7 @@ from trajlearn.dynamics.baselines import (
 )
 from trajlearn.dynamics.calibrated import CalibratedForecaster
 from trajlearn.dynamics.direct_reward import DirectRewardGP, DirectRewardNN
+from trajlearn.dynamics.distilled import DistilledForecaster
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.dynamics.lstm import LSTMRegressor
 from trajlearn.dynamics.one_step import OneStepRegressor
@@ -21,6 +23,7 @@ __all__ = [
     "CurveForecaster",
     "DirectRewardGP",
     "DirectRewardNN",
+    "DistilledForecaster",
     "Forecast",
     "HoldForecaster",
     "HorizonFeatures",
@@ -30,4 +33,5 @@ __all__ = [
     "PhaseFeatures",
     "ReferenceForecaster",
     "TrajectoryRegressor",
+    "differentiable",
 ]

@@ -30,6 +30,9 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
     baseline: Any
     baseline_: Any
 
+    # whether it predicts on a grid of the training steps only
+    _rolls_out = False
+
     # -- what a formulation defines -------------------------------------------------------
 
     @abstractmethod
@@ -231,7 +234,7 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
         if wanted.ndim != 1 or not len(wanted) or wanted[0] <= 0 or (np.diff(wanted) <= 0).any():
             raise ValueError("horizons must be positive and strictly increasing times.")
         grid, chosen = self._time_grid(wanted)
-        rolled = isinstance(self.baseline_, DynamicsEstimator) and hasattr(self.baseline_, "dt_")
+        rolled = isinstance(self.baseline_, DynamicsEstimator) and self.baseline_._rolls_out
         if rolled:
             grid, chosen = self.baseline_._time_grid(wanted)
         if callable(references):

@@ -43,6 +43,7 @@ class RollingEstimator(DynamicsEstimator):
     clip_states: float | None
     n_particles: int
 
+    _rolls_out = True
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **TwoDoorRegressor._parameter_constraints,
         "inputs": [StrOptions({"action", "params"}), "array-like"],

@@ -124,6 +124,10 @@ class BlockScaler(TransformerMixin, BaseEstimator):
     ----------
     state, action, horizon, params, phase : transformer, "passthrough" or None, default=None
         What each block is scaled by.
+    param_bounds : array-like of shape (p, 2) or None, default=None
+        Lower and upper bound of each parameter, mapped to -1 and 1 whatever the data hold. With
+        few theta in the log, or one, theta elsewhere in the bounds is then within the range of
+        the inputs. None scales params by the data (or by `params`).
     features : callable or None, default=None
         ``features(states (n, d_s), params (n, p)) -> (n, k)``: what is known to matter, such as
         the control error, computed from the unscaled rows. The k columns follow all blocks,
@@ -165,7 +169,7 @@ class BlockScaler(TransformerMixin, BaseEstimator):
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         slot: [HasMethods(["fit", "transform"]), StrOptions({"passthrough"}), None]
         for slot in ("state", "action", "horizon", "params", "phase")
-    } | {"features": [callable, None]}
+    } | {"param_bounds": ["array-like", None], "features": [callable, None]}
 
     def __init__(
         self,
@@ -175,6 +179,7 @@ class BlockScaler(TransformerMixin, BaseEstimator):
         horizon: Any = None,
         params: Any = None,
         phase: Any = None,
+        param_bounds: ArrayLike | None = None,
         features: Callable[[Floats, Floats], Any] | None = None,
     ) -> None:
         self.state = state
@@ -182,6 +187,7 @@ class BlockScaler(TransformerMixin, BaseEstimator):
         self.horizon = horizon
         self.params = params
         self.phase = phase
+        self.param_bounds = param_bounds
         self.features = features
 
     def fit(
@@ -211,7 +217,7 @@ class BlockScaler(TransformerMixin, BaseEstimator):
         ------
         ValueError
             If `features` is given and the layout has no states, or it returns something else
-            than a finite (n, k).
+            than a finite (n, k); if `param_bounds` are no bounds of the params in the rows.
         """
         self._validate_params()
         rows: Floats = validate_data(self, X, dtype=np.float64)
@@ -225,6 +231,9 @@ class BlockScaler(TransformerMixin, BaseEstimator):
             rows = np.concatenate([rows, computed], axis=1)
         largest = np.abs(rows).max(axis=0)
         constant = np.ptp(rows, axis=0) <= _CONSTANT * largest
+        if self.param_bounds is not None:
+            bounded = self._scaler_of_bounds(blocks)
+            constant[blocks["params"]] = False
         self.magnitude_ = np.where(largest > 0, largest, 1.0)
         self.parts_: list[tuple[NDArray[np.intp], Any]] = []
         self.block_columns_: dict[str, NDArray[np.intp]] = {}
@@ -233,7 +242,10 @@ class BlockScaler(TransformerMixin, BaseEstimator):
             columns = np.arange(rows.shape[1])[where]
             varying = columns[~constant[columns]]
             begin = width
-            if len(varying):
+            if block == "params" and self.param_bounds is not None:
+                self.parts_.append((varying, bounded))
+                width += len(varying)
+            elif len(varying):
                 transformer = self._transformer(block)
                 values = rows[:, varying]
                 if sample_weight is not None and has_fit_parameter(transformer, "sample_weight"):
@@ -248,6 +260,26 @@ class BlockScaler(TransformerMixin, BaseEstimator):
             self.block_columns_[block] = np.arange(begin, width)
         self._set_affine()
         return self
+
+    def _scaler_of_bounds(self, blocks: dict[str, slice]) -> MinMaxScaler:
+        """What maps `param_bounds` to -1 and 1."""
+        if self.params is not None:
+            raise ValueError("params= and param_bounds= both say how to scale params: give one.")
+        where = blocks.get("params", slice(0))
+        p = len(range(self.n_features_in_)[where])
+        bounds = np.asarray(self.param_bounds, dtype=np.float64)
+        if not p or bounds.shape != (p, 2):
+            raise ValueError(
+                f"param_bounds has shape {bounds.shape}, and the rows hold {p} params (blocks "
+                f"{list(blocks)}): give (p, 2), the lower and the upper bound of each"
+                + ("." if p else ", to a model that has params among its inputs.")
+            )
+        if not (np.isfinite(bounds).all() and (bounds[:, 0] < bounds[:, 1]).all()):
+            raise ValueError(
+                "param_bounds must be finite, with each lower bound below the upper one; got "
+                f"{bounds.tolist()}."
+            )
+        return MinMaxScaler((-1, 1)).fit(bounds.T)
 
     def _argument_columns(
         self, blocks: dict[str, slice]

@@ -19,7 +19,7 @@ from trajlearn.trajectories import SubtrajectoryRelabeler, TrajectoryDataset
 from trajlearn.trajectories._columns import runs
 from trajlearn.trajectories._layout import Layout
 from trajlearn.trajectories._pairs import Stretches
-from trajlearn.trajectories.times import time_steps
+from trajlearn.trajectories.times import median_step
 
 __all__ = ["TrajectoryRegressor"]
 
@@ -88,6 +88,8 @@ class TrajectoryRegressor(DynamicsEstimator):
     layout_ : mapping from block to slice
     max_horizon_ : float
         Longest horizon in training, as a time.
+    dt_ : float or None
+        Median time step of the training episodes; None for rows.
     state_range_ : ndarray of shape (2, d_s)
         Least and greatest training states.
     noise_time_ : ndarray of shape (d_s,)
@@ -170,6 +172,7 @@ class TrajectoryRegressor(DynamicsEstimator):
         names = tuple(self.layout_.columns["state"])
         self._learn_ranges(states, names, float(horizons.max()))
         self.noise_time_ = np.full(targets.shape[1], np.inf)
+        self.dt_: float | None = None
         self._learn_scale(rows, targets, weight)
         super()._fit_rows(rows, targets, weight, groups)
 
@@ -179,6 +182,7 @@ class TrajectoryRegressor(DynamicsEstimator):
         relabeler = self.relabeler_.fit(ds)
         self.layout_ = relabeler.layout_
         self.max_horizon_ = self._longest_horizon(ds)
+        self.dt_ = median_step(ds)
         if self.fresh_batches and hasattr(self.estimator_, "fit_stream"):
             self._fit_stream(ds, weight)
         else:
@@ -280,7 +284,7 @@ class TrajectoryRegressor(DynamicsEstimator):
         now, then = residual[:, :-1], residual[:, 1:]
         power = np.sqrt((now**2).sum(axis=(0, 1)) * (then**2).sum(axis=(0, 1)))
         correlation = (now * then).sum(axis=(0, 1)) / np.where(power > 0, power, 1.0)
-        step = float(np.median(time_steps(few)))
+        step = median_step(few)
         self.noise_time_ = -step / np.log(np.clip(correlation, 1e-6, 1 - 1e-6))
 
     # -- forecasting ----------------------------------------------------------------------

@@ -1,9 +1,10 @@
 """Pictures of forecasts and their errors, with matplotlib (``pip install "trajlearn[plot]"``).
 
 `plot_forecast` shows predicted against logged states, `plot_horizon_errors` how the error grows
-with the horizon, `plot_reward_table` how well rewards are predicted. Each draws into the axes it
-is given, or makes a figure, and returns the axes, so that titles, limits and legends can be
-changed afterwards.
+with the horizon, `plot_reward_table` how well rewards are predicted,
+`plot_search` and `plot_slices` how a policy search goes and what its model believes. Each draws
+into the axes it is given, or makes a figure, and returns the axes, so that titles, limits and
+legends can be changed afterwards.
 """
 
 from trajlearn.plotting.calibration import plot_coverage, plot_pit, plot_reliability
@@ -11,6 +12,7 @@ from trajlearn.plotting.errors import plot_horizon_errors
 from trajlearn.plotting.fan import plot_fan
 from trajlearn.plotting.forecasts import plot_forecast
 from trajlearn.plotting.rewards import plot_reward_table
+from trajlearn.plotting.search import plot_search, plot_slices
 
 __all__ = [
     "plot_coverage",
@@ -20,4 +22,6 @@ __all__ = [
     "plot_pit",
     "plot_reliability",
     "plot_reward_table",
+    "plot_search",
+    "plot_slices",
 ]

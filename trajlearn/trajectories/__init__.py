@@ -6,6 +6,7 @@ from trajlearn.trajectories.dataset import TrajectoryDataset
 from trajlearn.trajectories.episodes import EpisodeRelabeler
 from trajlearn.trajectories.frames import from_frame, to_frame
 from trajlearn.trajectories.kalman import KalmanSmoother
+from trajlearn.trajectories.params import ParamsTransformer
 from trajlearn.trajectories.sources import from_gymnasium, from_minari
 from trajlearn.trajectories.subtrajectories import SubtrajectoryRelabeler
 from trajlearn.trajectories.trajectory import Trajectory
@@ -14,6 +15,7 @@ from trajlearn.trajectories.transitions import TransitionRelabeler
 __all__ = [
     "EpisodeRelabeler",
     "KalmanSmoother",
+    "ParamsTransformer",
     "StateSpaceModel",
     "SubtrajectoryRelabeler",
     "Trajectory",

@@ -49,6 +49,12 @@ def episode_steps(ds: TrajectoryDataset) -> Floats:
     return np.where(high - low <= 1e-3 * middle, np.rint(middle * grid) / grid, np.nan)
 
 
+def median_step(ds: TrajectoryDataset) -> float:
+    """Median time step of all episodes."""
+    grid = float(time_grids(ds).max())
+    return float(np.rint(np.median(time_steps(ds)) * grid) / grid)
+
+
 def uniform_step(ds: TrajectoryDataset) -> float:
     """The common time step of all episodes.
 
@@ -57,13 +63,11 @@ def uniform_step(ds: TrajectoryDataset) -> float:
     MixedSamplingError
         If the steps differ by more than a thousandth.
     """
-    steps = time_steps(ds)
-    dt = float(np.median(steps))
+    steps, dt = time_steps(ds), median_step(ds)
     if np.abs(steps - dt).max() > 1e-3 * dt:
         raise MixedSamplingError(
             f"the time step varies from {steps.min():g} to {steps.max():g}, so one step means "
             'different things. Add "dt" to inputs=, resample the episodes (ds.resample(dt)), or '
             "use TrajectoryRegressor, which takes any horizon."
         )
-    grid = float(time_grids(ds).max())
-    return float(np.rint(dt * grid) / grid)
+    return dt

@@ -1,0 +1,103 @@
+"""Whether an objective makes sense, and whether its model can answer it."""
+
+from numbers import Integral
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from trajlearn.control._futures import predicts_rewards
+from trajlearn.dynamics._members import unwrapped
+
+__all__ = ["check_answerable", "checked_starts", "one_of", "time_step", "whole"]
+
+Floats = NDArray[np.float64]
+
+
+def whole(value: Any, name: str) -> int:
+    """A whole number, at least 1."""
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
+        raise ValueError(f"{name} = {value!r} must be a whole number, at least 1.")
+    return int(value)
+
+
+def one_of(allowed: tuple[str, ...], value: str, name: str) -> str:
+    """One of the allowed words."""
+    if value not in allowed:
+        raise ValueError(f"{name} = {value!r}; choose one of {list(allowed)}.")
+    return value
+
+
+def time_step(dt: float | None, model: Any) -> float:
+    """Time of a step, as given or as the model knows it.
+
+    Raises
+    ------
+    ValueError
+        If nobody says, or it is not a time.
+    """
+    if dt is None:
+        steps = (getattr(part, "dt_", None) for part in (model, unwrapped(model)))
+        dt = next((step for step in steps if step is not None), None)
+        if dt is None:
+            if not predicts_rewards(model):
+                name = type(unwrapped(model)).__name__
+                raise ValueError(f"{name} does not say how long a step is: give dt=.")
+            # predicts a whole trial, whatever its time
+            dt = 1.0
+    if not 0 < dt < np.inf:
+        raise ValueError(f"dt = {dt!r} must be a finite time greater than 0.")
+    return float(dt)
+
+
+def checked_starts(initial_states: ArrayLike) -> Floats:
+    """Initial states (n0, d_s)."""
+    states = np.atleast_2d(np.array(initial_states, dtype=np.float64))
+    if states.ndim != 2 or not states.size:
+        raise ValueError(
+            f"initial_states has shape {np.shape(initial_states)}; expected (n0, d_s)."
+        )
+    if not np.isfinite(states).all():
+        raise ValueError("initial_states has NaN or infinite values.")
+    return states
+
+
+def check_answerable(
+    model: Any, *, decision: str, constrained: bool, needs_actions: bool, every: int
+) -> None:
+    """Whether a model depends on the candidates and predicts what is asked about.
+
+    Parameters
+    ----------
+    model : estimator
+    decision : {"params", "actions"}
+    constrained : bool
+    needs_actions : bool
+        Whether the reward names actions.
+    every : int
+
+    Raises
+    ------
+    ValueError
+    """
+    name = type(unwrapped(model)).__name__
+    if predicts_rewards(model):
+        if constrained or decision == "actions":
+            asked = "constraint=" if constrained else "decision='actions'"
+            raise ValueError(f"{name} predicts rewards, not states, and so knows no {asked}.")
+        return
+    blocks = getattr(unwrapped(model), "layout_", None)
+    if blocks is not None and decision == "actions" and "action" not in blocks:
+        raise ValueError(
+            f"decision='actions', but {name} was fitted without actions: search over params, or "
+            "fit a one-step model of states and actions."
+        )
+    if blocks is not None and not {"params", "action"} & set(blocks):
+        raise ValueError(
+            f"{name} was fitted on episodes without params, so that nothing depends on the "
+            "candidates: give params with the episodes."
+        )
+    if needs_actions and decision == "params" and every > 1:
+        raise ValueError(
+            "a reward that names actions needs the state before each step: use every=1."
+        )

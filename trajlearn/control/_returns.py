@@ -1,0 +1,157 @@
+"""Sums of rewards along predicted trajectories, some of which end before the horizon."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from trajlearn.trajectories.rewards import Reward, step_rewards
+
+__all__ = ["Quadrature", "Returns", "States", "flags"]
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+# a question to each of the states (..., d_s)
+States = Callable[[Floats], Flags]
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """Sum over all steps of rewards that are known at some, linear in between.
+
+    Attributes
+    ----------
+    steps : ndarray of shape (k,)
+        The steps at which states are predicted, increasing; the last is the horizon.
+    weights : ndarray of shape (k,)
+        Of the reward at each.
+    until : ndarray of shape (k,)
+        The same of a sum that ends there: the steps since the one before.
+    start_weight : float
+        Of the reward of the initial state.
+    """
+
+    steps: NDArray[np.intp]
+    weights: Floats
+    until: Floats
+    start_weight: float
+
+    @classmethod
+    def of(cls, horizon: int, every: int, headless: bool = False) -> "Quadrature":
+        """Each `every`-th step and the last.
+
+        Without a reward of the initial state (`headless`), the first that is known stands for
+        all steps before.
+        """
+        steps = np.unique(np.append(np.arange(every, horizon + 1, every), horizon))
+        gaps = np.diff(steps, prepend=0)
+        # of a straight line over a gap of g steps, (g + 1) / 2 belongs to its end
+        until, after = (gaps + 1) / 2, np.append((gaps[1:] - 1) / 2, 0.0)
+        before = (gaps[0] - 1) / 2
+        if headless:
+            until[0] += before
+        return cls(steps, until + after, until, 0.0 if headless else float(before))
+
+
+@dataclass(frozen=True)
+class Returns:
+    """Return of predicted trajectories: the sum of their rewards, with what an early end costs.
+
+    Attributes
+    ----------
+    reward : callable
+    quadrature : Quadrature
+    start_part : ndarray of shape (n0,)
+        What the reward of each initial state adds.
+    is_terminal : callable or None
+    terminal_reward : float
+        Of each step after the end.
+    """
+
+    reward: Reward
+    quadrature: Quadrature
+    start_part: Floats
+    is_terminal: States | None
+    terminal_reward: float
+
+    def counted(self, states: Floats, gone: Flags | None) -> tuple[NDArray[np.intp], Flags]:
+        """Horizons (..., n) that a trajectory earns at, and whether the last of them is an end.
+
+        Parameters
+        ----------
+        states : ndarray of shape (..., n, k, d_s)
+            Finite.
+        gone : ndarray of shape (..., n, k) or None
+            Where states are unknown, because the forecast diverged.
+        """
+        n_horizons = states.shape[-2]
+        count = np.full(states.shape[:-2], n_horizons)
+        ended = np.zeros(states.shape[:-2], dtype=bool)
+        if gone is not None:
+            count = np.where(gone.any(axis=-1), gone.argmax(axis=-1), count)
+        if self.is_terminal is not None:
+            terminal = flags(self.is_terminal, states, "is_terminal")
+            if terminal.any():
+                first = terminal.argmax(axis=-1) + 1
+                ended = terminal.any(axis=-1) & (first <= count)
+                count = np.where(ended, first, count)
+        return count, ended
+
+    def of(self, states: Floats, count: NDArray[np.intp], **signals: Any) -> Floats:
+        """Returns (..., n_rows) of trajectories (..., n_rows, k, d_s), row i * n0 + j from start j.
+
+        Parameters
+        ----------
+        states : ndarray
+            Of a trajectory that ends early, the states after its end are possible ones that do
+            not count.
+        count : ndarray of shape (..., n_rows)
+            Horizons that each earns at.
+        **signals
+            What a reward may name.
+        """
+        values = step_rewards(self.reward, states, **signals)
+        sums = self._sums(values, count)
+        if not self.quadrature.start_weight:
+            return sums
+        start = np.tile(self.start_part, sums.shape[-1] // len(self.start_part))
+        # one that ends before the first horizon earns nothing on the way there
+        return np.where(count > 0, sums + start, sums)
+
+    def _sums(self, values: Floats, count: NDArray[np.intp]) -> Floats:
+        rule = self.quadrature
+        early = count < values.shape[-1]
+        with np.errstate(invalid="ignore"):
+            # row by row in one order, so that a candidate has the same bits in any batch
+            sums: Floats = np.ascontiguousarray(values * rule.weights).sum(axis=-1)
+        if not early.any():
+            return sums
+        few, last = values[early], count[early] - 1
+        at = np.arange(values.shape[-1])
+        weights = np.where(at < last[:, None], rule.weights, 0.0)
+        weights[at == last[:, None]] = rule.until[last[last >= 0]]
+        # a reward after the end may be infinite
+        earned = np.where(weights > 0, few, 0.0)
+        steps = np.where(last >= 0, rule.steps[last], 0)
+        missing = rule.steps[-1] - steps
+        sums[early] = (earned * weights).sum(axis=-1) + missing * self.terminal_reward
+        return sums
+
+
+def flags(ask: States, states: Floats, name: str) -> Flags:
+    """Answers (...) of a user's function about states (..., d_s).
+
+    Raises
+    ------
+    ValueError
+        If it does not give one truth value a state.
+    """
+    answers = np.asarray(ask(states))
+    if answers.shape != states.shape[:-1] or answers.dtype != bool:
+        raise ValueError(
+            f"{name} returned {answers.dtype} of shape {answers.shape} for states of shape "
+            f"{states.shape}; expected bool of shape {states.shape[:-1]} (one a state)."
+        )
+    return answers

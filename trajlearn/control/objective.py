@@ -1,0 +1,418 @@
+"""What a search maximises: the return that a model predicts for candidates."""
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from copy import copy
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from trajlearn.control._common_numbers import CommonNumbers
+from trajlearn.control._futures import (
+    Situation,
+    ask_forecast,
+    ask_reward,
+    draws_from_generators,
+    later,
+    predicts_rewards,
+    reference_function,
+)
+from trajlearn.control._objective_checks import (
+    check_answerable,
+    checked_starts,
+    one_of,
+    time_step,
+    whole,
+)
+from trajlearn.control._returns import Quadrature, Returns, States, flags
+from trajlearn.control._signals import Signals, named_by
+from trajlearn.dynamics._members import unwrapped
+from trajlearn.dynamics.forecast import Forecast
+from trajlearn.exceptions import CalibrationWarning, DivergenceWarning, HorizonWarning
+from trajlearn.trajectories._relabeler import generator
+from trajlearn.trajectories.rewards import Reward, step_rewards
+
+__all__ = ["Assessment", "PredictedReturn"]
+
+Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# states predicted at once, of all steps and samples: about 10 MB an array of 4 states
+_CHUNK_STATES = 2**18
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """What is predicted of m candidates.
+
+    Attributes
+    ----------
+    value : ndarray of shape (m,)
+        What is maximised.
+    reward : ndarray of shape (m,)
+        Predicted return, averaged over initial states.
+    std : ndarray of shape (m,) or None
+        Its standard deviation, where trajectories were sampled.
+    violation : ndarray of shape (m,) or None
+        Share of the sampled trajectories with a state that the constraint forbids.
+    """
+
+    value: Floats
+    reward: Floats
+    std: Floats | None
+    violation: Floats | None
+
+
+class PredictedReturn:
+    r"""Return that a fitted model predicts for control parameters, or for sequences of actions.
+
+    The return of a trial is the sum of its step rewards over `horizon` steps,
+
+    .. math:: R(\theta) = \frac1{n_0} \sum_{i=1}^{n_0} \sum_{t=1}^{H} r(\hat s_t(s_0^i, \theta)),
+
+    averaged over the initial states. With ``risk="mean"`` it is that of the mean trajectories,
+    and no uncertainty is asked for unless there is a constraint. With ``risk="lcb"`` trajectories
+    are sampled (one member of an ensemble and one path of noise each), and what is maximised is
+    the mean of their returns minus `kappa` standard deviations. All candidates get the same
+    random numbers, at every call, so that an optimiser sees one fixed function.
+
+    A trajectory that enters `is_terminal` earns the reward of that step, and `terminal_reward`
+    for each step after it, as a real trial does in
+    `trajlearn.trajectories.rewards.episode_rewards`; one that diverges earns it from there on.
+
+    Parameters
+    ----------
+    model : estimator
+        Fitted. Anything with `predict_trajectory`; a `Pipeline` or whatever else has a `predict`
+        of episodes; or `DirectRewardGP` or `DirectRewardNN` of the mean reward per step, fitted
+        on episodes or on rows ``[s_0 | params]``, for which reward, termination and `every` are
+        of no matter.
+    reward : callable
+        ``reward(states (..., d_s)) -> (...)`` of the states that steps lead into; it may also
+        name `actions`, `references` and `times`.
+    horizon : int
+        Steps of a trial.
+    dt : float or None, default=None
+        Time of a step. None: ``model.dt_``.
+    initial_states : array-like of shape (n0, d_s) or (d_s,)
+    risk : {"mean", "lcb"}, default="mean"
+    kappa : float, default=1.0
+        Standard deviations of a lower confidence bound.
+    n_samples : int, default=20
+        Trajectories sampled for each candidate and initial state, for "lcb" and a constraint.
+    is_terminal : callable or None, default=None
+        ``is_terminal(states (..., d_s)) -> bool (...)``: whether a trial ends there.
+    terminal_reward : float or None, default=None
+        Of each step after the end; `is_terminal` needs it, or crashing early might pay. Without
+        it a trajectory that diverges is worth -inf.
+    constraint : callable or None, default=None
+        ``constraint(states (..., d_s)) -> bool (...)``, True where a state is allowed.
+    every : int, default=1
+        Predict each `every`-th step and the last, with rewards linear in between; the initial
+        state's own reward is a knot of the line if the reward takes states alone. A trajectory
+        model is that much faster; a trial that would end in between ends at the next of them.
+    decision : {"params", "actions"}, default="params"
+        "actions": a candidate is a sequence of actions, for a model that was fitted with them.
+    policy : callable or None, default=None
+        ``policy(states, params, times) -> actions``, for one-step models (None: their own) and
+        for a reward that names `actions`.
+    references : array-like or callable, optional
+        ``references(times (n,)) -> (n, d_r)``, or values of shape (horizon + 1, d_r).
+    context : mapping from name to value, optional
+    phase : float, optional
+        Time since `time_origin` at the start.
+    start_time : float, default=0.0
+        Time at the initial states: what policy, references and a reward of `times` count from.
+    state_names : sequence of str, optional
+        Of the initial states, for a `Pipeline` that selects states by name.
+    random_state : int, RandomState or None, default=None
+
+    Attributes
+    ----------
+    horizons : ndarray of shape (k,)
+        Times after the start at which states are predicted.
+    weights : ndarray of shape (k,)
+        A return is ``start_part + rewards at the horizons @ weights``, unless it ends early.
+    start_part : ndarray of shape (n0,)
+    initial_states : ndarray of shape (n0, d_s)
+    terminal_reward : float
+        -inf if none was given.
+
+    Raises
+    ------
+    ValueError
+        If a parameter is wrong; when called, if candidates have another shape, or a reward is
+        NaN.
+
+    Examples
+    --------
+    The state settles at a rate theta; the reward is greatest where it settles at once.
+
+    >>> import numpy as np
+    >>> from trajlearn import TrajectoryDataset, TrajectoryRegressor
+    >>> from trajlearn.control import PredictedReturn
+    >>> rate = np.linspace(0.5, 1.5, 20)
+    >>> states = np.exp(-rate[:, None] * 0.1 * np.arange(31))[..., None]
+    >>> ds = TrajectoryDataset.from_arrays(states, params=rate[:, None], dt=0.1)
+    >>> model = TrajectoryRegressor(random_state=0).set_params(estimator__max_steps=300).fit(ds)
+    >>> objective = PredictedReturn(
+    ...     model, reward=lambda s: -s[..., 0], horizon=30, dt=0.1, initial_states=[1.0]
+    ... )
+    >>> found = objective([[0.6], [1.0], [1.4]]).reward
+    >>> bool(np.abs(found - [-13.5, -9.0, -6.6]).max() < 0.5)
+    True
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        *,
+        reward: Reward,
+        horizon: int,
+        dt: float | None = None,
+        initial_states: ArrayLike,
+        risk: str = "mean",
+        kappa: float = 1.0,
+        n_samples: int = 20,
+        is_terminal: States | None = None,
+        terminal_reward: float | None = None,
+        constraint: States | None = None,
+        every: int = 1,
+        decision: str = "params",
+        policy: Any = None,
+        references: ArrayLike | Callable[[Floats], ArrayLike] | None = None,
+        context: Mapping[str, Any] | None = None,
+        phase: float | None = None,
+        start_time: float = 0.0,
+        state_names: Sequence[str] | None = None,
+        random_state: Any = None,
+    ) -> None:
+        self.model, self.reward, self.constraint = model, reward, constraint
+        self.horizon, self.every = whole(horizon, "horizon"), whole(every, "every")
+        self.n_samples, self.kappa = whole(n_samples, "n_samples"), float(kappa)
+        self.risk = one_of(("mean", "lcb"), risk, "risk")
+        self.decision = one_of(("params", "actions"), decision, "decision")
+        if not self.kappa >= 0:
+            raise ValueError(f"kappa = {kappa!r} must be at least 0.")
+        if is_terminal is not None and terminal_reward is None:
+            raise ValueError(
+                "is_terminal= needs terminal_reward=, what each step after the end is worth: "
+                "without it crashing early might pay."
+            )
+        self.is_terminal = is_terminal
+        self.terminal_reward = -np.inf if terminal_reward is None else float(terminal_reward)
+        named = named_by(reward)
+        check_answerable(
+            model,
+            decision=self.decision,
+            constrained=constraint is not None,
+            needs_actions="actions" in named,
+            every=self.every,
+        )
+        self._direct, self.dt = predicts_rewards(model), time_step(dt, model)
+        self.policy = getattr(unwrapped(model), "policy", None) if policy is None else policy
+        self.references = None
+        if references is not None:
+            self.references = reference_function(references, self.dt, self.horizon)
+        self.context, self.phase = dict(context or {}), phase
+        self._state_names = None if state_names is None else tuple(state_names)
+        self._seed = int(generator(random_state).integers(2**62))
+        # shared with copies for other initial states
+        self._warned: set[bool] = set()
+        self._named, self._rule = named, Quadrature.of(self.horizon, self.every, bool(named))
+        self.horizons: Floats = np.asarray(self.dt * self._rule.steps)
+        self.weights = self._rule.weights
+        self._begin_at(initial_states, float(start_time))
+
+    def starting_at(self, initial_states: ArrayLike, *, time: float | None = None) -> Self:
+        """The same objective from other initial states, as in planning step after step.
+
+        Parameters
+        ----------
+        initial_states : array-like of shape (n0, d_s) or (d_s,)
+        time : float or None, default=None
+            Time there, by which the phase moves on, too; None leaves both as they are.
+
+        Returns
+        -------
+        PredictedReturn
+        """
+        other = copy(self)
+        if time is not None and self.phase is not None:
+            other.phase = self.phase + time - self.start_time
+        other._begin_at(initial_states, self.start_time if time is None else float(time))
+        return other
+
+    def __call__(self, candidates: ArrayLike) -> Assessment:
+        """Assess candidates.
+
+        Parameters
+        ----------
+        candidates : array-like of shape (m, p), or (m, horizon, d_a) for actions
+
+        Returns
+        -------
+        Assessment
+
+        Raises
+        ------
+        NoUncertaintyError
+            If trajectories are to be sampled and the model cannot.
+        ValueError
+            If candidates have another shape or are not finite, or a reward is NaN.
+        """
+        given = self._checked(candidates)
+        copies = self.n_samples if self._sampled() else 1
+        states = self.horizon * len(self.initial_states) * copies
+        size = max(_CHUNK_STATES // states, 1)
+        with warnings.catch_warnings():
+            # a diverged forecast has its value, and a search asks for thousands of them; what
+            # holds of all forecasts alike is said once
+            warnings.simplefilter("ignore", DivergenceWarning)
+            parts = []
+            for at in range(0, len(given), size):
+                if self._warned:
+                    warnings.simplefilter("ignore", HorizonWarning)
+                    warnings.simplefilter("ignore", CalibrationWarning)
+                parts.append(self._assess(given[at : at + size]))
+                self._warned.add(True)
+        reward, std, violation = (_joined(column) for column in zip(*parts))
+        assert reward is not None
+        value = reward
+        if self.risk == "lcb":
+            assert std is not None
+            with np.errstate(invalid="ignore"):
+                value = np.where(np.isfinite(reward), reward - self.kappa * std, -np.inf)
+        return Assessment(value, reward, std, violation)
+
+    # -- what is assessed -----------------------------------------------------------------
+
+    def _sampled(self) -> bool:
+        return not self._direct and (self.risk == "lcb" or self.constraint is not None)
+
+    def _assess(self, candidates: Floats) -> tuple[Floats, Floats | None, Floats | None]:
+        """Reward, std and violation of a chunk of candidates."""
+        if self._direct:
+            return self._assess_directly(candidates)
+        n_starts = len(self.initial_states)
+        shape = (len(candidates), n_starts)
+        n_samples = self.n_samples if self._sampled() else None
+        random_state: Any = self._seed
+        if n_samples and draws_from_generators(self.model):
+            random_state = CommonNumbers(
+                self._seed, n_samples, len(candidates) * n_starts, n_starts
+            )
+        forecast = ask_forecast(
+            self.model,
+            self._situation,
+            candidates,
+            n_samples=n_samples,
+            random_state=random_state,
+        )
+        mean = None
+        if self.risk == "mean":
+            returns, _ = self._returns(forecast.mean, _diverged(forecast), candidates)
+            mean = returns.reshape(shape).mean(axis=1)
+            if not n_samples:
+                return mean, None, None
+        samples = forecast.samples
+        # both were asked for
+        assert n_samples is not None
+        assert samples is not None
+        gone: Flags = np.asarray(~np.isfinite(samples).all(axis=-1))
+        returns, broken = self._returns(samples, gone if gone.any() else None, candidates)
+        # contiguous, so that numpy adds in the same order for one candidate as for many
+        drawn = np.ascontiguousarray(returns.reshape(n_samples, *shape).mean(axis=2).T)
+        with np.errstate(invalid="ignore"):
+            std = drawn.std(axis=1)
+        std[np.isinf(drawn).any(axis=1)] = np.inf
+        share = None if broken is None else broken.reshape(n_samples, *shape).mean(axis=(0, 2))
+        return drawn.mean(axis=1) if mean is None else mean, std, share
+
+    def _assess_directly(self, params: Floats) -> tuple[Floats, Floats | None, None]:
+        mean, std = ask_reward(self.model, self._situation, params, return_std=self.risk == "lcb")
+        shape = (len(params), len(self.initial_states))
+        reward = self.horizon * mean.reshape(shape).mean(axis=1)
+        if std is None:
+            return reward, None, None
+        # errors of one model at several initial states go together
+        return reward, self.horizon * std.reshape(shape).mean(axis=1), None
+
+    def _returns(
+        self, states: Floats, gone: Flags | None, candidates: Floats
+    ) -> tuple[Floats, Flags | None]:
+        """Returns (..., n) of trajectories (..., n, k, d_s), and which break the constraint."""
+        start = np.tile(self.initial_states, (len(candidates), 1))[:, None]
+        if gone is not None:
+            states = np.where(gone[..., None], start, states)
+        count, ended = self._rewarded.counted(states, gone)
+        n_horizons = states.shape[-2]
+        if (count < n_horizons).any():
+            # after the end stands a state that is possible
+            counts = np.arange(n_horizons) < count[..., None]
+            states = np.where(counts[..., None], states, start)
+        returns = self._rewarded.of(states, count, **self._signals.of(states, candidates))
+        if self.constraint is None or states.ndim == 3:
+            return returns, None
+        allowed = flags(self.constraint, states, "constraint")
+        lived = np.arange(n_horizons) < count[..., None]
+        broken: Flags = np.asarray((~allowed & lived).any(axis=-1))
+        if gone is not None:
+            broken |= gone.any(axis=-1) & ~ended
+        return returns, broken
+
+    # -- checks ---------------------------------------------------------------------------
+
+    def _begin_at(self, initial_states: ArrayLike, start_time: float) -> None:
+        self.initial_states, self.start_time = checked_starts(initial_states), start_time
+        policy, references = later(self.policy, self.references, start_time)
+        self._situation = Situation(
+            initial_states=self.initial_states,
+            horizons=self.horizons,
+            all_horizons=self.dt * np.arange(1.0, self.horizon + 1),
+            policy=policy,
+            references=references,
+            context=self.context,
+            phase=self.phase,
+            state_names=self._state_names,
+        )
+        self.start_part = np.zeros(len(self.initial_states))
+        if self._rule.start_weight and not self._direct:
+            reward = step_rewards(self.reward, self.initial_states)
+            self.start_part = self._rule.start_weight * reward
+        self._rewarded = Returns(
+            self.reward, self._rule, self.start_part, self.is_terminal, self.terminal_reward
+        )
+        self._signals = Signals(
+            self._named,
+            self._situation,
+            self._rule.steps,
+            start_time,
+            planned=self.decision == "actions",
+        )
+
+    def _checked(self, candidates: ArrayLike) -> Floats:
+        given = np.asarray(candidates, dtype=np.float64)
+        right = given.ndim == 2 if self.decision == "params" else given.ndim == 3
+        if right and self.decision == "actions":
+            right = given.shape[1] == self.horizon
+        if not right or not len(given):
+            expected = "(m, p)" if self.decision == "params" else f"(m, {self.horizon}, d_a)"
+            raise ValueError(f"candidates have shape {given.shape}; expected {expected}.")
+        if not np.isfinite(given).all():
+            raise ValueError("candidates have NaN or infinite values.")
+        return given
+
+
+def _diverged(forecast: Forecast) -> Flags | None:
+    """Where mean trajectories (n, k) are unknown; None if nowhere."""
+    first = forecast.diverged_at[:, None]
+    if not first.any():
+        return None
+    return (first > 0) & (np.arange(1, forecast.mean.shape[1] + 1) >= first)
+
+
+def _joined(parts: Sequence[Floats | None]) -> Floats | None:
+    return None if parts[0] is None else np.concatenate([p for p in parts if p is not None])

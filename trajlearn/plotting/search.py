@@ -1,0 +1,202 @@
+"""How a policy search goes, and what its model believes."""
+
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from trajlearn.plotting._style import GREY, INK, axes_or_new, line_style, pyplot, tidy
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+
+__all__ = ["plot_search", "plot_slices"]
+
+Floats = NDArray[np.float64]
+
+
+class _Assessed(Protocol):
+    """What a model predicts for candidates."""
+
+    reward: Floats
+    std: Floats | None
+
+
+class _Search(Protocol):
+    """What is drawn: any of the searches of `trajlearn.control`."""
+
+    @property
+    def best_params_(self) -> Floats: ...
+
+    @property
+    def bounds(self) -> ArrayLike: ...
+
+    def history(self) -> "pd.DataFrame": ...
+
+    def predict_return(self, params: ArrayLike) -> _Assessed: ...
+
+
+def plot_search(search: _Search, ax: "Axes | None" = None) -> "Axes":
+    """Return of each trial, the best so far, and what was predicted of each.
+
+    Parameters
+    ----------
+    search : PolicySearch, BayesianSearch or RandomSearch
+        With at least one trial.
+    ax : matplotlib Axes, optional
+        Default: a new figure.
+
+    Returns
+    -------
+    matplotlib Axes
+        A cross marks a trial that ended early; an error bar is one predicted standard deviation
+        to each side.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is missing.
+    ValueError
+        If no trial was told yet.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from trajlearn import RandomSearch, Trajectory
+    >>> search = RandomSearch(bounds=[[0, 1]], reward=lambda s: -s[..., 0], horizon=2)
+    >>> for _ in range(3):
+    ...     gain = search.ask()
+    ...     search = search.tell(Trajectory(states=np.full((3, 1), gain[0]), params=gain))
+    >>> ax = plot_search(search)
+    >>> ax.get_xlabel()
+    'trial'
+    """
+    pyplot("plot_search")
+    history = search.history()
+    if history.empty:
+        raise ValueError("the search has no trial yet: tell() it one.")
+    ax = axes_or_new(ax, "plot_search", (6.4, 3.4))
+    number = np.arange(1, len(history) + 1)
+    returns = history["return"].to_numpy(dtype=np.float64)
+    ended = history["terminated"].to_numpy(dtype=bool)
+    own = line_style(0)["color"]
+    ax.step(number, history["best"], where="post", color=INK, lw=1.3, label="best so far")
+    ax.plot(number[~ended], returns[~ended], "o", color=own, label="trial")
+    if ended.any():
+        ax.plot(number[ended], returns[ended], "X", ms=8, color=own, label="ended early")
+    predicted = history["predicted"].to_numpy(dtype=np.float64)
+    if np.isfinite(predicted).any():
+        std = history["predicted_std"].fillna(0.0).to_numpy(dtype=np.float64)
+        look: dict[str, Any] = {"fmt": "D", "mfc": "white", "capsize": 3, "ms": 5}
+        # beside its trial, so that one does not hide the other
+        ax.errorbar(
+            number + 0.12, predicted, std, color=line_style(1)["color"], label="predicted", **look
+        )
+    ax.set_xlabel("trial")
+    ax.set_ylabel("return")
+    ax.xaxis.get_major_locator().set_params(integer=True)
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, frameon=False, fontsize="small")
+    tidy(ax)
+    return ax
+
+
+def plot_slices(
+    search: _Search,
+    params: ArrayLike | None = None,
+    *,
+    n_points: int = 41,
+    axes: Any = None,
+) -> NDArray[Any]:
+    """Predicted return along each parameter, the others held: where the model is sure.
+
+    Parameters
+    ----------
+    search : PolicySearch or BayesianSearch
+        With a model and at least one trial.
+    params : array-like of shape (p,), optional
+        The point that the slices go through. Default: the best tried.
+    n_points : int, default=41
+        Points along each parameter, from bound to bound.
+    axes : array-like of matplotlib Axes, optional
+        One a parameter. Default: a new figure, four in a row.
+
+    Returns
+    -------
+    ndarray of matplotlib Axes of shape (p,)
+        Shaded: one standard deviation of the predicted return to each side, where the model gives
+        one. The vertical line is `params`; ticks above the axis are the values tried so far.
+
+    Raises
+    ------
+    ImportError
+        If matplotlib is missing.
+    ValueError
+        If `params` or the number of axes is wrong.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sklearn.linear_model import LinearRegression
+    >>> from trajlearn import OneStepRegressor, PolicySearch, TrajectoryDataset
+    >>> states = np.cumprod(np.repeat([[1.0], [0.5], [0.8]], 6, axis=1), axis=1)[..., None]
+    >>> ds = TrajectoryDataset.from_arrays(states, params=[[0.0], [0.5], [0.2]])
+    >>> model = OneStepRegressor(LinearRegression(), inputs="params")
+    >>> search = PolicySearch(
+    ...     model, bounds=[[0, 1]], reward=lambda s: -np.abs(s[..., 0]), horizon=5, random_state=0
+    ... ).tell(ds)
+    >>> (ax,) = plot_slices(search, n_points=5)
+    >>> ax.get_xlabel()
+    'theta0'
+    """
+    plt = pyplot("plot_slices")
+    bounds = np.asarray(search.bounds, dtype=np.float64)
+    n_params = len(bounds)
+    through = np.asarray(search.best_params_ if params is None else params, dtype=np.float64)
+    if through.shape != (n_params,):
+        raise ValueError(f"params has shape {through.shape}; expected ({n_params},).")
+    history = search.history()
+    names = list(history.columns[1 : 1 + n_params])
+    if axes is None:
+        across = min(n_params, 4)
+        down = -(-n_params // across)
+        _, axes = plt.subplots(
+            down,
+            across,
+            sharey=True,
+            squeeze=False,
+            figsize=(1.2 + 2.3 * across, 0.6 + 2.3 * down),
+            layout="constrained",
+        )
+        for ax in axes.ravel()[n_params:]:
+            ax.remove()
+        axes = axes.ravel()[:n_params]
+    panels = np.atleast_1d(np.asarray(axes, dtype=object)).ravel()
+    if len(panels) != n_params:
+        raise ValueError(f"{len(panels)} axes for {n_params} parameters: give one a parameter.")
+    lines = np.tile(through, (n_params, n_points, 1))
+    for i, (low, high) in enumerate(bounds):
+        lines[i, :, i] = np.linspace(low, high, n_points)
+    assessed = search.predict_return(lines.reshape(-1, n_params))
+    means = assessed.reward.reshape(n_params, n_points)
+    colour = line_style(0)["color"]
+    for i, (ax, name) in enumerate(zip(panels, names)):
+        x = lines[i, :, i]
+        if assessed.std is not None:
+            std = assessed.std.reshape(n_params, n_points)[i]
+            ax.fill_between(x, means[i] - std, means[i] + std, color=colour, alpha=0.25, lw=0)
+        ax.plot(x, means[i], color=colour, lw=1.6)
+        ax.axvline(through[i], color=INK, lw=1, ls="dotted")
+        tried = history[name].to_numpy(dtype=np.float64)
+        ax.plot(
+            tried,
+            np.full(len(tried), 0.98),
+            "|",
+            color=GREY,
+            ms=8,
+            transform=ax.get_xaxis_transform(),
+        )
+        ax.set_xlabel(name)
+        tidy(ax)
+    panels[0].set_ylabel("predicted return")
+    return panels
