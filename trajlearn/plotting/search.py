@@ -73,6 +73,8 @@ def plot_search(search: _Search, ax: "Axes | None" = None) -> "Axes":
     'trial'
     """
     pyplot("plot_search")
+    from matplotlib.ticker import MaxNLocator
+
     history = search.history()
     if history.empty:
         raise ValueError("the search has no trial yet: tell() it one.")
@@ -95,7 +97,7 @@ def plot_search(search: _Search, ax: "Axes | None" = None) -> "Axes":
         )
     ax.set_xlabel("trial")
     ax.set_ylabel("return")
-    ax.xaxis.get_major_locator().set_params(integer=True)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, frameon=False, fontsize="small")
     tidy(ax)
     return ax
