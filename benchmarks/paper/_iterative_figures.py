@@ -37,8 +37,12 @@ def draw(tables: Tables) -> "dict[str, Figure]":
         ax.set_xlabel("trial")
         ax.set_xticks(sorted(of.trials["trial"].unique()))
         tidy(ax)
-    at = axes[0].get_yaxis_transform()
-    axes[0].text(1.0, NEAR, "5 % ", color=GREY, ha="right", va="top", fontsize=8, transform=at)
+    at = axes[1].get_yaxis_transform()
+    for y, va, text, colour in (
+        (1.0, "bottom", "best known", INK),
+        (NEAR, "top", "within 5 %", GREY),
+    ):
+        axes[1].text(1.01, y, text, color=colour, va=va, fontsize=8, transform=at)
     axes[0].set_ylabel("best return so far (1: best known)")
     axes[0].set_ylim(_lowest(of), 1.03)
     legend_below(figure, axes[0], 3)
@@ -62,11 +66,8 @@ def _curve(ax: "Axes", of: Result, method: str, column: str, i: int) -> None:
 
 
 def _lowest(of: Result) -> float:
-    """Where the axis begins: below every median and the inner percentiles."""
-    lows = [
-        spread(of.by_trial(method, column), INNER)[0] if method in _SHADED else medians
-        for column in PANELS
-        for method in of.methods
-        for medians in [of.by_trial(method, column).median()]
+    """Where the axis begins: below every median; percentiles may go on under it."""
+    medians = [
+        of.by_trial(method, column).median().min() for column in PANELS for method in of.methods
     ]
-    return max(min(float(low.min()) for low in lows) - 0.03, -0.2)
+    return min(medians) - 0.1

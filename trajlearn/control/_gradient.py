@@ -1,6 +1,7 @@
 """Gradient ascent on the return that a trajectory model predicts: it is differentiable in theta."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,8 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats.qmc import Sobol
 
 from trajlearn.control._climb import Climb
-from trajlearn.control._optimizers import Found, _checked_start, checked_bounds
-from trajlearn.control._returns import Quadrature
+from trajlearn.control._futures import Situation
+from trajlearn.control._optimizers import Found, checked_bounds, checked_start
+from trajlearn.control._returns import Returns
 from trajlearn.control.objective import PredictedReturn
 from trajlearn.dynamics._differentiable import differentiable
 from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES
@@ -59,7 +61,7 @@ def value_and_gradient(objective: PredictedReturn, params: ArrayLike) -> tuple[F
     ValueError
         If the objective has no derivative; it says why.
     """
-    gradient = ReturnGradient(objective)
+    gradient = objective.gradient()
     theta = np.asarray(params, dtype=np.float64)
     if theta.ndim != 2 or theta.shape[1] != gradient.n_params or not np.isfinite(theta).all():
         raise ValueError(
@@ -69,11 +71,14 @@ def value_and_gradient(objective: PredictedReturn, params: ArrayLike) -> tuple[F
 
 
 class ReturnGradient:
-    """`value_and_gradient` of one objective, prepared once.
+    """`value_and_gradient` of one objective, prepared once by `PredictedReturn.gradient`.
 
     Parameters
     ----------
-    objective : PredictedReturn
+    model : estimator
+        One of `trajlearn.dynamics.differentiable`.
+    situation : Situation
+    returns : Returns
 
     Attributes
     ----------
@@ -81,18 +86,16 @@ class ReturnGradient:
         p.
     """
 
-    def __init__(self, objective: PredictedReturn) -> None:
-        _check(objective)
-        self._objective = objective
-        self._function = differentiable(objective.model, context=objective._situation.context)
+    def __init__(self, model: Any, situation: Situation, returns: Returns) -> None:
+        self._situation, self._returns = situation, returns
+        self._function = differentiable(model, context=situation.context)
         self.n_params = self._function.n_params
-        low, high = unwrapped(objective.model).state_range_
+        low, high = unwrapped(model).state_range_
         self._middle, self._range = (low + high) / 2, np.where(high > low, high - low, 1.0)
 
     def __call__(self, params: Floats) -> tuple[Floats, Floats]:
         """Values (m,) and gradients (m, p) of candidates (m, p)."""
-        objective = self._objective
-        states = len(objective.initial_states) * len(objective.horizons)
+        states = len(self._situation.initial_states) * len(self._situation.horizons)
         size = max(_CHUNK_STATES // (states * self._function.n_members), 1)
         # sums on several threads may differ in bits
         with threads_for(0.0):
@@ -101,13 +104,13 @@ class ReturnGradient:
         return values, gradients
 
     def _chunk(self, params: Floats) -> tuple[Floats, Floats]:
-        objective = self._objective
-        shape = len(params), len(objective.initial_states)
+        situation = self._situation
+        shape = len(params), len(situation.initial_states)
         theta = torch.tensor(params, device=self._function.device, requires_grad=True)
         means = self._function(
-            np.tile(objective.initial_states, (len(params), 1)),
+            situation.starts(len(params)),
             theta.repeat_interleave(shape[1], dim=0),
-            objective.horizons,
+            situation.horizons,
         ).mean(dim=0)
         returns, slopes = self._slopes(means.detach().cpu().numpy(), params)
         values = returns.reshape(shape).mean(axis=1)
@@ -119,52 +122,23 @@ class ReturnGradient:
 
     def _slopes(self, states: Floats, params: Floats) -> tuple[Floats, Floats]:
         """Returns (n,) of trajectories (n, k, d_s), and their derivative in the states."""
-        objective = self._objective
         with np.errstate(invalid="ignore"):
             near = np.abs(states - self._middle) <= DIVERGENCE_RANGES * self._range
         gone = np.logical_or.accumulate(~near.all(axis=-1), axis=-1)
-        returns, _ = objective._returns(states, gone if gone.any() else None, params)
-        # where a trajectory has diverged or ended, states that are possible: they do not count
-        start = np.tile(objective.initial_states, (len(params), 1))[:, None]
-        states = np.where(gone[..., None], start, states)
-        count, _ = objective._rewarded.counted(states, gone)
-        weights = _weights(objective._rewarded.quadrature, count)
-        states = np.where(weights[..., None] > 0, states, start)
+        states, count, _ = self._returns.lived(states, gone if gone.any() else None)
+        returns = self._returns.of(states, count, params)
+        weights = self._returns.quadrature.earned(count)
         slopes = np.empty_like(states)
-        signals = objective._signals.of(states, params)
+        reward, signals = self._returns.reward, self._returns.signals.of(states, params)
         with np.errstate(all="ignore"):
             for j, step in enumerate(_STEP * self._range):
                 ends = []
                 for sign in (1, -1):
                     shifted = states.copy()
                     shifted[..., j] += sign * step
-                    ends.append(np.asarray(objective.reward(shifted, **signals), dtype=np.float64))
+                    ends.append(np.asarray(reward(shifted, **signals), dtype=np.float64))
                 slopes[..., j] = weights * (ends[0] - ends[1]) / (2 * step)
         return returns, np.where(np.isfinite(slopes) & (weights > 0)[..., None], slopes, 0.0)
-
-
-def _weights(rule: Quadrature, count: NDArray[np.intp]) -> Floats:
-    """Weight (n, k) of the reward at each horizon, for trajectories that earn at `count` (n,)."""
-    at, last = np.arange(len(rule.weights)), count[:, None] - 1
-    whole = count[:, None] == len(at)
-    ends = np.where(at == last, rule.until, 0.0)
-    return np.where(whole | (at < last), rule.weights, ends)
-
-
-def _check(objective: PredictedReturn) -> None:
-    """Raise ValueError if the objective has a part without a derivative."""
-    reason = None
-    if objective.risk != "mean":
-        reason = f"risk={objective.risk!r} is computed from sampled trajectories"
-    elif objective.decision != "params":
-        reason = f"decision={objective.decision!r} is not over params"
-    elif "actions" in objective._signals.names:
-        reason = "the reward names actions, whose derivative is unknown"
-    if reason is not None:
-        raise ValueError(
-            f"the predicted return has no gradient here: {reason}. Search without gradients "
-            "(optimizer='cma')."
-        )
 
 
 def ascend(
@@ -221,7 +195,7 @@ def ascend(
         raise ValueError(
             f"n_evaluations = {n_evaluations} and n_restarts = {n_restarts} must be at least 1."
         )
-    gradient = ReturnGradient(objective)
+    gradient = objective.gradient()
     if len(box) != gradient.n_params:
         raise ValueError(
             f"bounds has {len(box)} rows, but the model was fitted with {gradient.n_params} params."
@@ -263,7 +237,7 @@ def _first_points(
     """Points of the unit cube to climb from: the start points, then Sobol points."""
     given = np.empty((0, len(box)))
     if start is not None:
-        given = (_checked_start(start, box) - box[:, 0]) / (box[:, 1] - box[:, 0])
+        given = (checked_start(start, box) - box[:, 0]) / (box[:, 1] - box[:, 0])
     n = max(min(n_restarts, n_evaluations // _LEAST_STEPS), len(given), 1)
     fresh = max(n - len(given), 0)
     # a power of two, as the sequence is made for

@@ -10,7 +10,7 @@ from scipy.stats.qmc import Sobol
 
 from trajlearn.trajectories._extras import import_extra
 
-__all__ = ["METHODS", "Found", "checked_bounds", "maximise"]
+__all__ = ["METHODS", "Found", "checked_bounds", "checked_start", "maximise"]
 
 Floats = NDArray[np.float64]
 # candidates (m, d) to values (m,)
@@ -49,8 +49,11 @@ class Sampler(Protocol):
     def ask(self) -> Floats:
         """Next batch (population, d)."""
 
+    def begin(self, point: Floats) -> None:
+        """Start at a point (d,) of unknown value."""
+
     def tell(self, points: Floats, values: Floats) -> None:
-        """Values (m,) of the batch, or of the start points; -inf is a failure."""
+        """Values (m,) of the batch, after those of start points; -inf is a failure."""
 
 
 def checked_bounds(bounds: ArrayLike) -> Floats:
@@ -102,6 +105,7 @@ def maximise(
     rng : Generator
     start : array-like of shape (d,) or (k, d), optional
         Evaluated first, so that what is found is never worse; CMA-ES and CEM begin at the best.
+        A single point (d,) is evaluated in one batch with the first draws around it.
     population : int, optional
         Candidates a batch. None: 32 for CMA-ES, 64 for CEM, 256 for random search.
     on_batch : callable, optional
@@ -147,19 +151,34 @@ def maximise(
         return values
 
     sampler = sampler_of(len(box), size, rng)
+    waiting, waiting_points = np.empty((0, len(box))), np.empty((0, len(box)))
     if start is not None:
-        first = _checked_start(start, box)[:n_evaluations]
-        sampler.tell(np.clip((first - low) / width, 0.0, 1.0), evaluate(first))
+        first = checked_start(start, box)[:n_evaluations]
+        points = np.clip((first - low) / width, 0.0, 1.0)
+        if np.ndim(start) == 1:
+            sampler.begin(points[0])
+            waiting, waiting_points = first, points
+        else:
+            sampler.tell(points, evaluate(first))
     while (left := n_evaluations - best.n_evaluations) > 0:
-        points = sampler.ask()[:left]
+        points = sampler.ask()[: left - len(waiting)]
         # rounding must not carry a candidate over a bound
-        values = evaluate(np.clip(low + points * width, box[:, 0], box[:, 1]))
-        if len(points) < left:
-            sampler.tell(points, values)
+        drawn = np.clip(low + points * width, box[:, 0], box[:, 1])
+        values = evaluate(np.concatenate([waiting, drawn]))
+        if len(values) < left:
+            sampler.tell(np.concatenate([waiting_points, points]), values)
+        waiting, waiting_points = waiting[:0], waiting_points[:0]
     return best
 
 
-def _checked_start(start: ArrayLike, box: Floats) -> Floats:
+def checked_start(start: ArrayLike, box: Floats) -> Floats:
+    """Start points (k, d), within the bounds (d, 2).
+
+    Raises
+    ------
+    ValueError
+        If the shape is another, or a point is out of bounds by more than rounding.
+    """
     points = np.atleast_2d(np.array(start, dtype=np.float64))
     if points.ndim != 2 or points.shape[1] != len(box) or not len(points):
         raise ValueError(
@@ -183,6 +202,9 @@ class _Uniform:
     def ask(self) -> Floats:
         return self._rng.random(self._shape)
 
+    def begin(self, point: Floats) -> None:
+        pass
+
     def tell(self, points: Floats, values: Floats) -> None:
         pass
 
@@ -193,6 +215,9 @@ class _CrossEntropy:
     def __init__(self, d: int, size: int, rng: np.random.Generator) -> None:
         self._shape, self._rng = (size, d), rng
         self._begin()
+
+    def begin(self, point: Floats) -> None:
+        self._mean = point
 
     def _begin(self) -> None:
         d = self._shape[1]
@@ -238,6 +263,9 @@ class _CmaEs:
         self._strategy: Any = None
         self._worst = -np.inf
 
+    def begin(self, point: Floats) -> None:
+        self._begin = point
+
     def ask(self) -> Floats:
         if self._strategy is None:
             self._strategy = self._new()
@@ -246,11 +274,13 @@ class _CmaEs:
         return np.array(self._asked)[:, : self._d]
 
     def tell(self, points: Floats, values: Floats) -> None:
-        finite = values[np.isfinite(values)]
         if self._strategy is None:
-            if len(finite):
+            if np.isfinite(values).any():
                 self._begin = points[values.argmax()]
             return
+        # its own draws, not a start before them
+        values = values[-len(self._asked) :]
+        finite = values[np.isfinite(values)]
         # pycma takes no infinite values: failures are a little worse than the worst so far
         self._worst = float(np.max(-finite, initial=self._worst))
         failed = self._worst + 1e-3 * abs(self._worst) + 1e-9 if self._worst > -np.inf else 0.0

@@ -13,9 +13,9 @@ from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import Interval, StrOptions
 from trajlearn.control._decisions import Plan, Session
-from trajlearn.control._guarded import Guarded
 from trajlearn.control._optimizers import METHODS, checked_bounds, maximise
-from trajlearn.control.objective import PredictedReturn
+from trajlearn.control._safe_set import Guarded
+from trajlearn.control.objective import RISKS, PredictedReturn
 from trajlearn.dynamics._members import unwrapped
 from trajlearn.exceptions import CalibrationWarning, HorizonWarning
 
@@ -67,7 +67,7 @@ class Planner(BaseEstimator):
         "beyond_end": ["boolean"],
         "is_terminal": [callable, None],
         "terminal_reward": [Real, None],
-        "risk": [StrOptions({"mean", "lcb"})],
+        "risk": [StrOptions(set(RISKS))],
         "kappa": [Interval(Real, 0, None, closed="left")],
         "n_samples": [Interval(Integral, 2, None, closed="left")],
         "constraint": [callable, None],
@@ -161,7 +161,7 @@ class Planner(BaseEstimator):
                 rng=rng,
                 start=self._start(self._before(session, shape), box, rng),
             )
-        if guarded.best is None or not np.isfinite(guarded.value):
+        if guarded.best is None:
             raise ValueError(
                 f"none of {found.n_evaluations} candidates has a finite predicted return: look at "
                 "the reward, terminal_reward= and the bounds."
@@ -179,14 +179,15 @@ class Planner(BaseEstimator):
         return plan
 
     def _start(self, before: Floats | None, box: Floats, rng: np.random.Generator) -> Floats | None:
-        """Candidates (k, d) to begin with: the decision before, and all random ones."""
-        warm = np.empty((0, len(box))) if before is None else np.clip(before, *box.T)[None]
+        """Candidates to begin with: the decision before (d,), and all random ones (k, d)."""
+        warm = None if before is None else np.clip(before, *box.T)
         if self.optimizer != "random":
-            return None if before is None else warm
+            return warm
         # one batch, as a roll-out of one candidate takes hardly less time than that of many
-        n_fresh = self.n_candidates - len(warm)
-        fresh = rng.uniform(box[:, 0], box[:, 1], size=(n_fresh, len(box)))
-        return np.concatenate([warm, fresh])
+        fresh = rng.uniform(
+            box[:, 0], box[:, 1], size=(self.n_candidates - (warm is not None), len(box))
+        )
+        return fresh if warm is None else np.concatenate([warm[None], fresh])
 
     def _before(self, session: Session, shape: tuple[int, ...]) -> Floats | None:
         """The decision before as a candidate (d,): actions moved on, the last one repeated."""
@@ -231,6 +232,7 @@ class Planner(BaseEstimator):
     def _check(self) -> None:
         """Check the parameters, and whether the model can be planned with."""
         self._validate_params()
+        checked_bounds(self.bounds)
         if hasattr(self.model, "fit"):
             check_is_fitted(self.model)
         blocks = getattr(unwrapped(self.model), "layout_", None)

@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from trajlearn.control._signals import Signals
 from trajlearn.trajectories.rewards import Reward, step_rewards
 
 __all__ = ["Quadrature", "Returns", "States", "flags"]
@@ -54,6 +54,13 @@ class Quadrature:
             until[0] += before
         return cls(steps, until + after, until, 0.0 if headless else float(before))
 
+    def earned(self, count: NDArray[np.intp]) -> Floats:
+        """Weights (..., k) of trajectories that earn at the first `count` (...) horizons only."""
+        at, last = np.arange(len(self.weights)), count[..., None] - 1
+        whole = last == at[-1]
+        ends = np.where(at == last, self.until, 0.0)
+        return np.where(whole | (at < last), self.weights, ends)
+
 
 @dataclass(frozen=True)
 class Returns:
@@ -63,8 +70,11 @@ class Returns:
     ----------
     reward : callable
     quadrature : Quadrature
+    initial_states : ndarray of shape (n0, d_s)
     start_part : ndarray of shape (n0,)
         What the reward of each initial state adds.
+    signals : Signals
+        What a reward may name.
     is_terminal : callable or None
     terminal_reward : float
         Of each step after the end.
@@ -72,20 +82,43 @@ class Returns:
 
     reward: Reward
     quadrature: Quadrature
+    initial_states: Floats
     start_part: Floats
+    signals: Signals
     is_terminal: States | None
     terminal_reward: float
 
-    def counted(self, states: Floats, gone: Flags | None) -> tuple[NDArray[np.intp], Flags]:
-        """Horizons (..., n) that a trajectory earns at, and whether the last of them is an end.
+    def lived(
+        self, states: Floats, gone: Flags | None
+    ) -> tuple[Floats, NDArray[np.intp], Flags]:
+        """States, how many horizons a trajectory earns at, and whether the last is an end.
 
         Parameters
         ----------
         states : ndarray of shape (..., n, k, d_s)
-            Finite.
+            Row i * n0 + j from start j.
         gone : ndarray of shape (..., n, k) or None
             Where states are unknown, because the forecast diverged.
+
+        Returns
+        -------
+        states : ndarray of shape (..., n, k, d_s)
+            With states that are possible where a trajectory is unknown, or over.
+        count : ndarray of shape (..., n)
+        ended : ndarray of shape (..., n)
         """
+        n_rows, n_horizons = states.shape[-3:-1]
+        n_candidates = n_rows // len(self.initial_states)
+        start = np.tile(self.initial_states, (n_candidates, 1))[:, None]
+        if gone is not None:
+            states = np.where(gone[..., None], start, states)
+        count, ended = self._counted(states, gone)
+        if (count < n_horizons).any():
+            counts = np.arange(n_horizons) < count[..., None]
+            states = np.where(counts[..., None], states, start)
+        return states, count, ended
+
+    def _counted(self, states: Floats, gone: Flags | None) -> tuple[NDArray[np.intp], Flags]:
         n_horizons = states.shape[-2]
         count = np.full(states.shape[:-2], n_horizons)
         ended = np.zeros(states.shape[:-2], dtype=bool)
@@ -99,20 +132,9 @@ class Returns:
                 count = np.where(ended, first, count)
         return count, ended
 
-    def of(self, states: Floats, count: NDArray[np.intp], **signals: Any) -> Floats:
-        """Returns (..., n_rows) of trajectories (..., n_rows, k, d_s), row i * n0 + j from start j.
-
-        Parameters
-        ----------
-        states : ndarray
-            Of a trajectory that ends early, the states after its end are possible ones that do
-            not count.
-        count : ndarray of shape (..., n_rows)
-            Horizons that each earns at.
-        **signals
-            What a reward may name.
-        """
-        values = step_rewards(self.reward, states, **signals)
+    def of(self, states: Floats, count: NDArray[np.intp], candidates: Floats) -> Floats:
+        """Returns (..., n) of trajectories that `lived`, row i * n0 + j of candidate i."""
+        values = step_rewards(self.reward, states, **self.signals.of(states, candidates))
         sums = self._sums(values, count)
         if not self.quadrature.start_weight:
             return sums
@@ -128,10 +150,7 @@ class Returns:
             sums: Floats = np.ascontiguousarray(values * rule.weights).sum(axis=-1)
         if not early.any():
             return sums
-        few, last = values[early], count[early] - 1
-        at = np.arange(values.shape[-1])
-        weights = np.where(at < last[:, None], rule.weights, 0.0)
-        weights[at == last[:, None]] = rule.until[last[last >= 0]]
+        few, last, weights = values[early], count[early] - 1, rule.earned(count[early])
         # a reward after the end may be infinite
         earned = np.where(weights > 0, few, 0.0)
         steps = np.where(last >= 0, rule.steps[last], 0)

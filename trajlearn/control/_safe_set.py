@@ -1,38 +1,91 @@
 """Candidates that are likely enough to keep a constraint."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["best_to_worst", "ranked"]
+__all__ = ["Guarded", "best_to_worst", "ranked"]
 
 Floats = NDArray[np.float64]
 
+# more than the logarithm of any float
+_BELOW = 1e3
+# less than two shares of violation differ, divided by that logarithm
+_TIE = 1e-6
 
-def ranked(value: Floats, violation: Floats, limit: float, scale: float) -> Floats:
-    """Values in their order, and below them all that violate too much, by how much they do.
+
+def ranked(value: Floats, violation: Floats | None, limit: float) -> Floats:
+    """Numbers in the order of values, and below them all that violate too much, least first.
 
     So an optimiser that begins where all violates is led to where less does, whatever the values
-    are there.
+    are there; they decide between equal violations only.
 
     Parameters
     ----------
-    value, violation : ndarray of shape (m,)
+    value : ndarray of shape (m,)
+    violation : ndarray of shape (m,) or None
+        None leaves values as they are.
     limit : float
         Greatest violation that is none.
-    scale : float
-        Typical size of values.
 
     Returns
     -------
     ndarray of shape (m,)
-        From -1 to 1, and from -2 to -1 beyond the limit.
+        -inf where the value is not finite.
     """
-    with np.errstate(invalid="ignore"):
-        squashed = value / (scale + np.abs(value))
-    squashed = np.where(np.isfinite(value), squashed, -1.0)
-    return np.where(violation <= limit, squashed, -1.0 - violation)
+    known = np.isfinite(value)
+    if violation is None:
+        return np.where(known, value, -np.inf)
+    # within 710 of 0, in the order of values
+    order = np.sign(value) * np.log1p(np.abs(value))
+    broken = -_BELOW * (1.0 + violation) + _TIE * order
+    return np.where(known, np.where(violation <= limit, order, broken), -np.inf)
+
+
+class Guarded:
+    """Ranks of candidates for an optimiser, see `ranked`; it remembers the first of all it saw.
+
+    Parameters
+    ----------
+    assess : callable
+        From candidates to an `Assessment`.
+    max_violation : float
+    shape : tuple of int
+        What a candidate is reshaped to before it is assessed.
+
+    Attributes
+    ----------
+    best : ndarray of shape (d,) or None
+        The candidate of the greatest value among those that keep the constraint, or, where none
+        does, the one that breaks it least; None where none has a finite value.
+    value : float
+    violation : float or None
+        Of `best`.
+    """
+
+    def __init__(
+        self, assess: Callable[[Floats], Any], max_violation: float, shape: tuple[int, ...]
+    ) -> None:
+        self._assess = assess
+        self._max_violation = max_violation
+        self._shape = shape
+        self._rank = -np.inf
+        self.best: Floats | None = None
+        self.value = -np.inf
+        self.violation: float | None = None
+
+    def __call__(self, candidates: Floats) -> Floats:
+        """Ranks (m,) of flat candidates (m, d)."""
+        found = self._assess(candidates.reshape(len(candidates), *self._shape))
+        ranks = ranked(found.value, found.violation, self._max_violation)
+        at = int(ranks.argmax())
+        if ranks[at] > self._rank:
+            self._rank, self.best = float(ranks[at]), candidates[at].copy()
+            self.value = float(found.value[at])
+            self.violation = None if found.violation is None else float(found.violation[at])
+        return ranks
 
 
 def best_to_worst(batches: Sequence[tuple[Floats, Floats]], n: int) -> tuple[Floats, Floats]:

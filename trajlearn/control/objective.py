@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,7 +34,12 @@ from trajlearn.exceptions import CalibrationWarning, DivergenceWarning, HorizonW
 from trajlearn.trajectories._relabeler import generator
 from trajlearn.trajectories.rewards import Reward, step_rewards
 
-__all__ = ["Assessment", "PredictedReturn"]
+if TYPE_CHECKING:
+    from trajlearn.control._gradient import ReturnGradient
+
+__all__ = ["RISKS", "Assessment", "PredictedReturn"]
+
+RISKS = ("mean", "expected", "lcb")
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -73,10 +78,11 @@ class PredictedReturn:
     .. math:: R(\theta) = \frac1{n_0} \sum_{i=1}^{n_0} \sum_{t=1}^{H} r(\hat s_t(s_0^i, \theta)),
 
     averaged over the initial states. With ``risk="mean"`` it is that of the mean trajectories,
-    and no uncertainty is asked for unless there is a constraint. With ``risk="lcb"`` trajectories
-    are sampled (one member of an ensemble and one path of noise each), and what is maximised is
-    the mean of their returns minus `kappa` standard deviations. All candidates get the same
-    random numbers, at every call, so that an optimiser sees one fixed function.
+    and no uncertainty is asked for unless there is a constraint. With ``risk="expected"``
+    trajectories are sampled (one member of an ensemble and one path of noise each), and what is
+    maximised is the mean of their returns; with ``risk="lcb"`` it is that less `kappa` standard
+    deviations. All candidates get the same random numbers, at every call, so that an optimiser
+    sees one fixed function.
 
     A trajectory that enters `is_terminal` earns the reward of that step, and `terminal_reward`
     for each step after it, as a real trial does in
@@ -97,11 +103,14 @@ class PredictedReturn:
     dt : float or None, default=None
         Time of a step. None: ``model.dt_``.
     initial_states : array-like of shape (n0, d_s) or (d_s,)
-    risk : {"mean", "lcb"}, default="mean"
+    risk : {"mean", "expected", "lcb"}, default="mean"
+        See the Notes for where "mean", the fastest, misleads. A direct reward model predicts an
+        expected return either way.
     kappa : float, default=1.0
-        Standard deviations of a lower confidence bound.
+        Standard deviations of a lower confidence bound; with 0 it is "expected".
     n_samples : int, default=20
-        Trajectories sampled for each candidate and initial state, for "lcb" and a constraint.
+        Trajectories sampled for each candidate and initial state, for "expected", "lcb" and a
+        constraint.
     is_terminal : callable or None, default=None
         ``is_terminal(states (..., d_s)) -> bool (...)``: whether a trial ends there.
     terminal_reward : float or None, default=None
@@ -145,6 +154,13 @@ class PredictedReturn:
     ValueError
         If a parameter is wrong; when called, if candidates have another shape, or a reward is
         NaN.
+
+    Notes
+    -----
+    The return of the mean trajectory is not the mean return. Where trials may go either way, as
+    with a pendulum that falls to the left or to the right, the mean of both goes neither way: it
+    stays upright, and "mean" rates a controller that falls as highly as one that balances.
+    "expected" costs `n_samples` times as many trajectories and does not have this fault.
 
     Examples
     --------
@@ -192,7 +208,7 @@ class PredictedReturn:
         self.model, self.reward, self.constraint = model, reward, constraint
         self.horizon, self.every = whole(horizon, "horizon"), whole(every, "every")
         self.n_samples, self.kappa = whole(n_samples, "n_samples"), float(kappa)
-        self.risk = one_of(("mean", "lcb"), risk, "risk")
+        self.risk = one_of(RISKS, risk, "risk")
         self.decision = one_of(("params", "actions"), decision, "decision")
         if not self.kappa >= 0:
             raise ValueError(f"kappa = {kappa!r} must be at least 0.")
@@ -287,10 +303,39 @@ class PredictedReturn:
                 value = np.where(np.isfinite(reward), reward - self.kappa * std, -np.inf)
         return Assessment(value, reward, std, violation)
 
+    def gradient(self) -> "ReturnGradient":
+        """The derivative of the predicted return in theta, of a model that has one.
+
+        Returns
+        -------
+        callable
+            From params (m, p) to returns (m,) and gradients (m, p).
+
+        Raises
+        ------
+        ValueError
+            If there is none; it says why.
+        """
+        from trajlearn.control._gradient import ReturnGradient
+
+        reason = None
+        if self.risk != "mean":
+            reason = f"risk={self.risk!r} is computed from sampled trajectories"
+        elif self.decision != "params":
+            reason = f"decision={self.decision!r} is not over params"
+        elif "actions" in self._named:
+            reason = "the reward names actions, whose derivative is unknown"
+        if reason is not None:
+            raise ValueError(
+                f"the predicted return has no gradient here: {reason}. Search without gradients "
+                "(optimizer='cma')."
+            )
+        return ReturnGradient(self.model, self._situation, self._returns)
+
     # -- what is assessed -----------------------------------------------------------------
 
     def _sampled(self) -> bool:
-        return not self._direct and (self.risk == "lcb" or self.constraint is not None)
+        return not self._direct and (self.risk != "mean" or self.constraint is not None)
 
     def _assess(self, candidates: Floats) -> tuple[Floats, Floats | None, Floats | None]:
         """Reward, std and violation of a chunk of candidates."""
@@ -313,7 +358,7 @@ class PredictedReturn:
         )
         mean = None
         if self.risk == "mean":
-            returns, _ = self._returns(forecast.mean, _diverged(forecast), candidates)
+            returns, _ = self._judged(forecast.mean, _diverged(forecast), candidates)
             mean = returns.reshape(shape).mean(axis=1)
             if not n_samples:
                 return mean, None, None
@@ -322,7 +367,7 @@ class PredictedReturn:
         assert n_samples is not None
         assert samples is not None
         gone: Flags = np.asarray(~np.isfinite(samples).all(axis=-1))
-        returns, broken = self._returns(samples, gone if gone.any() else None, candidates)
+        returns, broken = self._judged(samples, gone if gone.any() else None, candidates)
         # contiguous, so that numpy adds in the same order for one candidate as for many
         drawn = np.ascontiguousarray(returns.reshape(n_samples, *shape).mean(axis=2).T)
         with np.errstate(invalid="ignore"):
@@ -340,24 +385,16 @@ class PredictedReturn:
         # errors of one model at several initial states go together
         return reward, self.horizon * std.reshape(shape).mean(axis=1), None
 
-    def _returns(
+    def _judged(
         self, states: Floats, gone: Flags | None, candidates: Floats
     ) -> tuple[Floats, Flags | None]:
         """Returns (..., n) of trajectories (..., n, k, d_s), and which break the constraint."""
-        start = np.tile(self.initial_states, (len(candidates), 1))[:, None]
-        if gone is not None:
-            states = np.where(gone[..., None], start, states)
-        count, ended = self._rewarded.counted(states, gone)
-        n_horizons = states.shape[-2]
-        if (count < n_horizons).any():
-            # after the end stands a state that is possible
-            counts = np.arange(n_horizons) < count[..., None]
-            states = np.where(counts[..., None], states, start)
-        returns = self._rewarded.of(states, count, **self._signals.of(states, candidates))
+        states, count, ended = self._returns.lived(states, gone)
+        returns = self._returns.of(states, count, candidates)
         if self.constraint is None or states.ndim == 3:
             return returns, None
         allowed = flags(self.constraint, states, "constraint")
-        lived = np.arange(n_horizons) < count[..., None]
+        lived = np.arange(states.shape[-2]) < count[..., None]
         broken: Flags = np.asarray((~allowed & lived).any(axis=-1))
         if gone is not None:
             broken |= gone.any(axis=-1) & ~ended
@@ -382,15 +419,20 @@ class PredictedReturn:
         if self._rule.start_weight and not self._direct:
             reward = step_rewards(self.reward, self.initial_states)
             self.start_part = self._rule.start_weight * reward
-        self._rewarded = Returns(
-            self.reward, self._rule, self.start_part, self.is_terminal, self.terminal_reward
-        )
-        self._signals = Signals(
-            self._named,
-            self._situation,
-            self._rule.steps,
-            start_time,
-            planned=self.decision == "actions",
+        self._returns = Returns(
+            self.reward,
+            self._rule,
+            self.initial_states,
+            self.start_part,
+            Signals(
+                self._named,
+                self._situation,
+                self._rule.steps,
+                start_time,
+                planned=self.decision == "actions",
+            ),
+            self.is_terminal,
+            self.terminal_reward,
         )
 
     def _checked(self, candidates: ArrayLike) -> Floats:

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 __all__ = ["plot_search", "plot_slices"]
 
 Floats = NDArray[np.float64]
+_CROSS: dict[str, Any] = {"marker": "X", "ms": 8}
 
 
 class _Assessed(Protocol):
@@ -50,8 +51,8 @@ def plot_search(search: _Search, ax: "Axes | None" = None) -> "Axes":
     Returns
     -------
     matplotlib Axes
-        A cross marks a trial that ended early; an error bar is one predicted standard deviation
-        to each side.
+        Grey: trials that were logged, not proposed. A cross marks a trial that ended early; an
+        error bar is one predicted standard deviation to each side.
 
     Raises
     ------
@@ -79,26 +80,42 @@ def plot_search(search: _Search, ax: "Axes | None" = None) -> "Axes":
     if history.empty:
         raise ValueError("the search has no trial yet: tell() it one.")
     ax = axes_or_new(ax, "plot_search", (6.4, 3.4))
-    number = np.arange(1, len(history) + 1)
+    number = history["trial"].to_numpy()
     returns = history["return"].to_numpy(dtype=np.float64)
     ended = history["terminated"].to_numpy(dtype=bool)
-    own = line_style(0)["color"]
+    logged = (history["source"] == "logged").to_numpy()
     ax.step(number, history["best"], where="post", color=INK, lw=1.3, label="best so far")
-    ax.plot(number[~ended], returns[~ended], "o", color=own, label="trial")
-    if ended.any():
-        ax.plot(number[ended], returns[ended], "X", ms=8, color=own, label="ended early")
+    for chosen, colour, label in (
+        (logged, GREY, "logged"),
+        (~logged, line_style(0)["color"], "trial"),
+    ):
+        looks = (chosen & ~ended, {"marker": "o"}, ""), (chosen & ended, _CROSS, ", ended early")
+        for shown, look, more in looks:
+            if shown.any():
+                look = look | {"mfc": "white" if colour == GREY else colour}
+                ax.plot(
+                    number[shown], returns[shown], ls="", color=colour, label=label + more, **look
+                )
     predicted = history["predicted"].to_numpy(dtype=np.float64)
     if np.isfinite(predicted).any():
-        std = history["predicted_std"].fillna(0.0).to_numpy(dtype=np.float64)
-        look: dict[str, Any] = {"fmt": "D", "mfc": "white", "capsize": 3, "ms": 5}
+        std = history["predicted_std"].to_numpy(dtype=np.float64)
         # beside its trial, so that one does not hide the other
+        aside = 0.12 + 0.004 * len(number)
         ax.errorbar(
-            number + 0.12, predicted, std, color=line_style(1)["color"], label="predicted", **look
+            number + aside,
+            predicted,
+            std if np.isfinite(std).any() else None,
+            fmt="D",
+            ms=5,
+            mfc="white",
+            capsize=3,
+            color=line_style(1)["color"],
+            label="predicted",
         )
     ax.set_xlabel("trial")
     ax.set_ylabel("return")
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=4, frameon=False, fontsize="small")
+    ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, fontsize="small")
     tidy(ax)
     return ax
 
@@ -127,14 +144,17 @@ def plot_slices(
     -------
     ndarray of matplotlib Axes of shape (p,)
         Shaded: one standard deviation of the predicted return to each side, where the model gives
-        one. The vertical line is `params`; ticks above the axis are the values tried so far.
+        one. The vertical line is `params`; ticks above the panel are the values tried so far,
+        where they are within its range.
 
     Raises
     ------
     ImportError
         If matplotlib is missing.
+    TypeError
+        If the search has no model, as a `RandomSearch`.
     ValueError
-        If `params` or the number of axes is wrong.
+        If `params`, `n_points` or the number of axes is wrong.
 
     Examples
     --------
@@ -152,13 +172,23 @@ def plot_slices(
     'theta0'
     """
     plt = pyplot("plot_slices")
+    if not hasattr(search, "predict_return"):
+        raise TypeError(
+            f"{type(search).__name__} has no model that predicts returns: use plot_search, or tell "
+            "the trials to a PolicySearch or a BayesianSearch."
+        )
+    if n_points < 2:
+        raise ValueError(f"n_points = {n_points} must be at least 2.")
     bounds = np.asarray(search.bounds, dtype=np.float64)
     n_params = len(bounds)
     through = np.asarray(search.best_params_ if params is None else params, dtype=np.float64)
     if through.shape != (n_params,):
         raise ValueError(f"params has shape {through.shape}; expected ({n_params},).")
+    if not np.isfinite(through).all():
+        raise ValueError("params has NaN or infinite values.")
     history = search.history()
     names = list(history.columns[1 : 1 + n_params])
+    first_of_row = slice(0, 1)
     if axes is None:
         across = min(n_params, 4)
         down = -(-n_params // across)
@@ -172,7 +202,7 @@ def plot_slices(
         )
         for ax in axes.ravel()[n_params:]:
             ax.remove()
-        axes = axes.ravel()[:n_params]
+        axes, first_of_row = axes.ravel()[:n_params], slice(None, None, across)
     panels = np.atleast_1d(np.asarray(axes, dtype=object)).ravel()
     if len(panels) != n_params:
         raise ValueError(f"{len(panels)} axes for {n_params} parameters: give one a parameter.")
@@ -189,16 +219,18 @@ def plot_slices(
             ax.fill_between(x, means[i] - std, means[i] + std, color=colour, alpha=0.25, lw=0)
         ax.plot(x, means[i], color=colour, lw=1.6)
         ax.axvline(through[i], color=INK, lw=1, ls="dotted")
+        ends = [min(x[0], through[i]), max(x[-1], through[i])]
+        margin = 0.04 * (ends[1] - ends[0])
+        ax.set_xlim(ends[0] - margin, ends[1] + margin)
         tried = history[name].to_numpy(dtype=np.float64)
+        tried = tried[(tried >= ends[0]) & (tried <= ends[1])]
+        # above the panel, where no curve is
+        top = ax.get_xaxis_transform()
         ax.plot(
-            tried,
-            np.full(len(tried), 0.98),
-            "|",
-            color=GREY,
-            ms=8,
-            transform=ax.get_xaxis_transform(),
+            tried, np.full(len(tried), 1.03), "|", color=GREY, ms=8, transform=top, clip_on=False
         )
         ax.set_xlabel(name)
         tidy(ax)
-    panels[0].set_ylabel("predicted return")
+    for ax in panels[first_of_row]:
+        ax.set_ylabel("predicted return")
     return panels
