@@ -1,4 +1,4 @@
-"""Notebooks on real flights and on uncertainty, run small; all run when the pages are built."""
+"""Notebooks on flights, uncertainty and tuning, run small; all run when the pages are built."""
 
 import json
 import os
@@ -51,6 +51,27 @@ print(json.dumps({
 }, default=float))
 """
 
+FOUND_OF_TUNING = """
+import json
+
+try:
+    asked = careful.ask().tolist()
+except UnsafeProposalError:
+    asked = None
+print(json.dumps({
+    "log": search.returns_[: len(log)].tolist(),
+    "trials": search.returns_[len(log) :].tolist(),
+    "gains": search.history()[list(plant.param_names)][len(log) :].to_numpy().tolist(),
+    "bounds": bounds.tolist(),
+    "n_forecasts": len(forecasts),
+    "on track": bool(furthest < 0.5),
+    "asked on a short track": asked,
+    "best": {" ".join(map(str, index)): row.tolist() for index, row in best.iterrows()},
+    "resumed": np.array_equal(search.ask(), waiting),
+    "planning": rows,
+}, default=float))
+"""
+
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_no_outputs_are_stored(path):
@@ -83,6 +104,12 @@ def uncertainty():
     """Results of the notebook on 110 short episodes."""
     settings = {"TRAJLEARN_NOTEBOOK_EPISODES": "110"}
     return told_by("uncertainty", FOUND_OF_UNCERTAINTY, settings)
+
+
+@pytest.fixture(scope="module")
+def tuning():
+    """Results of the notebook with one repeat."""
+    return told_by("tune_a_controller", FOUND_OF_TUNING, {"TRAJLEARN_NOTEBOOK_REPEATS": "1"})
 
 
 def test_real_flights_runs_on_a_few(found):
@@ -180,3 +207,39 @@ def test_propagations_and_pitfalls_of_the_notebook(uncertainty):
     assert infinite
     assert "19 or more calibration episodes" in warning
     assert all(0.7 < share <= 1 for share in uncertainty["cases"].values())
+
+
+def test_four_trials_are_far_better_than_twenty_logged_ones(tuning):
+    assert len(tuning["log"]) == 20
+    assert len(tuning["trials"]) == tuning["n_forecasts"] == 4
+    assert max(tuning["trials"]) > 0.75 * max(tuning["log"])  # returns are negative
+    low, high = np.transpose(tuning["bounds"])
+    gains = np.array(tuning["gains"])
+    assert ((gains >= low) & (gains <= high)).all()
+    assert len(np.unique(gains, axis=0)) == 4
+
+
+def test_a_careful_search_of_the_notebook_stays_on_the_track_or_asks_for_nothing(tuning):
+    assert tuning["on track"]
+    assert tuning["asked on a short track"] is None
+
+
+def test_searches_of_the_notebook_are_compared_on_the_same_log(tuning):
+    best = tuning["best"]
+    assert len(best) == 4
+    assert len({curve[0] for curve in best.values()}) == 1
+    assert all((np.diff(curve) >= 0).all() for curve in best.values())
+    final = {name.rsplit(" ", 1)[0]: curve[-1] for name, curve in best.items()}
+    assert final["one-step, formula known"] > final["Bayesian optimisation"]
+
+
+def test_a_search_of_the_notebook_goes_on_where_it_stopped(tuning):
+    assert tuning["resumed"]
+
+
+def test_planning_of_the_notebook(tuning):
+    fixed, *planned = tuning["planning"]
+    assert "decisions" not in fixed
+    assert [row["decisions"] for row in planned] == [100, 10, 10]
+    assert all(0 < row["seconds a decision"] < 10 for row in planned)
+    assert all(row["return"] > min(tuning["log"]) for row in planned)

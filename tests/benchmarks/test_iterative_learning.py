@@ -69,12 +69,12 @@ def test_the_best_known_is_better_than_guesses(monkeypatch):
     monkeypatch.setitem(CONTROL_TASKS, "cartpole", short)
     monkeypatch.setitem(_control_tasks._N_STARTS, "cartpole", 3)
     monkeypatch.setitem(_control_tasks._N_TEST, "cartpole", 3)
-    monkeypatch.setitem(_control_tasks._BUDGET, "cartpole", (60, 60))
+    monkeypatch.setitem(_control_tasks._BUDGET["quick"], "cartpole", (20, 2, 32))
     found = _control_tasks.best_known("cartpole", "quick")
     assert found["per_step"] == pytest.approx(found["test"])
     assert found["test"] >= found["centre"] > found["floor"] == 0.0
     assert found["paper_start"] == pytest.approx(short.true_return(PAPER_START)[0])
-    assert found["n_evaluations"] == 60
+    assert found["n_evaluations"] == 20 + 2 * 32
 
 
 def test_the_scale_ends_at_the_best_known():
@@ -100,7 +100,8 @@ def small(monkeypatch):
     monkeypatch.setattr(_iterative_methods, "N_PLANNED", {"cartpole": 2, "reacher": 1})
     monkeypatch.setattr(_control_tasks, "_N_STARTS", {"cartpole": 2, "reacher": 1})
     monkeypatch.setattr(_control_tasks, "_N_TEST", {"cartpole": 2, "reacher": 1})
-    monkeypatch.setattr(_control_tasks, "_BUDGET", {"cartpole": (4, 4), "reacher": (4, 4)})
+    few = dict.fromkeys(CONTROL_TASKS, (3, 1, 4))
+    monkeypatch.setitem(_control_tasks._BUDGET, "quick", few)
     for name in ("cartpole", "reacher"):
         short = replace(CONTROL_TASKS[name], length=30)
         monkeypatch.setitem(CONTROL_TASKS, name, short)

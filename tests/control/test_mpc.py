@@ -13,7 +13,6 @@ from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
 
 from trajlearn.control import _planner
-from trajlearn.control._guarded import Guarded
 from trajlearn.control.mpc import MPC
 from trajlearn.dynamics import OneStepRegressor, TrajectoryRegressor
 from trajlearn.envs import Cartpole, Reacher
@@ -210,39 +209,15 @@ def test_lower_confidence_bound_is_another_objective(asked):
         for risk, kappa in (("mean", 1.0), ("lcb", 1.0), ("lcb", 2.0))
     ]
     assert plans[0].value > plans[1].value > plans[2].value
+    expected, bound = (
+        mpc(noisy, n_samples=5, n_candidates=20, horizon=10, **risk).plan(STARTS[0])
+        for risk in ({"risk": "expected"}, {"risk": "lcb", "kappa": 0.0})
+    )
+    assert expected.value == bound.value > plans[1].value
+    np.testing.assert_array_equal(expected.params, bound.params)
 
 
 # -- the constraint -----------------------------------------------------------------------
-
-
-def assessed(value, violation):
-    return lambda candidates: SimpleNamespace(
-        value=value(candidates[:, 0]),
-        violation=None if violation is None else violation(candidates[:, 0]),
-    )
-
-
-def test_best_candidate_that_keeps_the_constraint():
-    guarded = Guarded(assessed(lambda x: x, lambda x: np.where(x > 3, 0.2, 0.05)), 0.05, (1,))
-    assert guarded(np.array([[1.0], [9.0], [2.0]])).tolist() == [1.0, -np.inf, 2.0]
-    guarded(np.array([[1.5], [8.0]]))
-    assert guarded.best.tolist() == [2.0]
-    assert (guarded.value, guarded.violation) == (2.0, 0.05)
-
-
-def test_least_violation_where_none_keeps_it():
-    guarded = Guarded(assessed(lambda x: x, lambda x: x / 10), 0.05, (1,))
-    guarded(np.array([[7.0], [3.0]]))
-    guarded(np.array([[5.0], [4.0]]))
-    assert guarded.best.tolist() == [3.0]
-    assert guarded.violation == pytest.approx(0.3)
-
-
-def test_nan_is_worst_and_nothing_is_promised_without_a_constraint():
-    guarded = Guarded(assessed(lambda x: np.where(x > 3, np.nan, x), None), 0.05, (1,))
-    guarded(np.array([[7.0], [3.0]]))
-    assert guarded.best.tolist() == [3.0]
-    assert guarded.violation is None
 
 
 def test_constraint_is_kept_in_the_plan():
@@ -321,6 +296,8 @@ def test_warm_start_begins_with_the_theta_before(exact, asked, optimizer):
     planner.plan(STARTS[0])
     np.testing.assert_array_equal(asked[1].batches[0][0], before.params)
     assert sum(map(len, asked[1].batches)) == 70
+    # in one batch with others, as a roll-out of one takes as long
+    assert len(asked[1].batches[0]) > 1
     planner.reset().plan(STARTS[0])
     assert not (asked[2].batches[0][0] == before.params).any()
     asked.clear()
@@ -439,7 +416,7 @@ def test_trial_that_ends_early_is_data():
     planner = MPC(
         # the wrong way round: as far out as it can
         model, bounds=-env.param_bounds[:, ::-1], reward=lambda s: s[..., 2] ** 2,
-        horizon=20, hold=5, n_candidates=10, random_state=0,
+        horizon=20, hold=5, n_candidates=10, warm_start=False, random_state=0,
     )  # fmt: skip
     trials = planner.run(env, env.reset(2, random_state=0), 300)
     assert trials.terminated.all()
@@ -560,6 +537,15 @@ def test_parameters_need_a_policy_to_act_by_not_to_plan(trajectory):
 def test_wrong_states_are_named(exact, state):
     with pytest.raises(ValueError, match="state"):
         mpc(exact).plan(state)
+
+
+def test_a_run_that_cannot_begin_loses_no_decisions(exact):
+    planner = mpc(exact, n_candidates=10)
+    planner.act(STARTS[0])
+    before = planner.decisions_
+    with pytest.raises(ValueError, match="lower bound must be less"):
+        planner.set_params(bounds=[[1.0, 0.0], [0.0, 1.0]]).run(ENV, STARTS, 5)
+    assert planner.decisions_.equals(before)
 
 
 def test_wrong_runs_are_named(exact):

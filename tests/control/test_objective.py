@@ -5,6 +5,7 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
+from sklearn.exceptions import NotFittedError
 from sklearn.frozen import FrozenEstimator
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
@@ -450,6 +451,28 @@ def test_the_lower_bound_of_a_gaussian_return(gaussian):
     np.testing.assert_allclose(two.std, 0.5 * HORIZON / np.sqrt(2), rtol=0.05)
 
 
+def test_the_mean_return_is_not_the_return_of_the_mean_trajectory(gaussian):
+    settings = {"reward": lambda s: -(s[..., 0] ** 2), "random_state": 0, "initial_states": [0.0]}
+    mean = objective(gaussian, **settings)(THETA)
+    np.testing.assert_allclose(mean.value, 0.0, atol=1e-12)
+    expected = objective(gaussian, risk="expected", n_samples=4000, **settings)(THETA)
+    np.testing.assert_allclose(expected.value, -(0.5**2) * HORIZON, rtol=0.05)
+    # to the bit what a lower bound without a width is
+    bound = objective(gaussian, risk="lcb", kappa=0.0, n_samples=4000, **settings)(THETA)
+    for name in ("value", "reward", "std"):
+        np.testing.assert_array_equal(getattr(expected, name), getattr(bound, name))
+
+
+@pytest.mark.parametrize("risk", ["mean", "expected"])
+def test_a_direct_reward_model_predicts_an_expected_return_already(risk):
+    rows = np.random.default_rng(0).uniform(size=(12, 2))
+    model = DirectRewardNN(random_state=0).set_params(estimator__max_steps=5)
+    model.fit(rows, rows.sum(axis=1))
+    found = objective(model, risk=risk, initial_states=[0.2])([[0.5]])
+    np.testing.assert_allclose(found.value, HORIZON * model.predict([[0.2, 0.5]]))
+    assert found.std is None
+
+
 def test_the_share_that_breaks_a_constraint(gaussian):
     found = objective(
         gaussian,
@@ -589,7 +612,34 @@ def test_policies_references_and_rewards_know_the_time(plant):
     np.testing.assert_allclose(moved(PAIRS).value, expected)
 
 
+def test_rows_of_references_count_from_the_start_time(plant):
+    def tracking(references, **settings):
+        return PredictedReturn(
+            plant,
+            reward=lambda states, references: references[..., 0],
+            horizon=3,
+            dt=1.0,
+            initial_states=TWO,
+            policy=lambda states, params, times: params[:, :1],
+            references=references,
+            **settings,
+        )
+
+    rows = np.array([[1.0], [2.0], [4.0], [8.0], [16.0]])
+    assert tracking(rows)(PAIRS).value[0] == 2 + 4 + 8
+    assert tracking(rows, start_time=100.0)(PAIRS).value[0] == 2 + 4 + 8
+    assert tracking(rows).starting_at(TWO, time=1.0)(PAIRS).value[0] == 4 + 8 + 16
+    with pytest.raises(ValueError, match="references has 5 rows, from time 0 to 4, but is needed"):
+        tracking(rows).starting_at(TWO, time=2.0)(PAIRS)
+
+
 # -- bad input, and warnings ---------------------------------------------------------------
+
+
+def test_a_model_that_is_not_fitted_is_named():
+    for model in (TrajectoryRegressor(), FrozenEstimator(TrajectoryRegressor())):
+        with pytest.raises(NotFittedError, match="TrajectoryRegressor"):
+            objective(model)
 
 
 def test_a_horizon_beyond_training_is_said_once_and_a_divergence_never(drift):
@@ -609,7 +659,7 @@ def test_a_horizon_beyond_training_is_said_once_and_a_divergence_never(drift):
         ({"horizon": 0}, "horizon = 0"),
         ({"every": 1.5}, "every = 1.5"),
         ({"n_samples": True}, "n_samples = True"),
-        ({"risk": "max"}, r"risk = 'max'; choose one of \['mean', 'lcb'\]"),
+        ({"risk": "max"}, r"risk = 'max'; choose one of \['mean', 'expected', 'lcb'\]"),
         ({"decision": "gains"}, "decision = 'gains'"),
         ({"decision": "actions"}, "fitted without actions"),
         ({"kappa": -1.0}, "kappa = -1.0"),

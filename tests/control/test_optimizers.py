@@ -102,6 +102,30 @@ def test_the_start_is_not_lost(method):
     np.testing.assert_array_equal(few.params, start[0])
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_where_it_begins_is_in_the_first_batch(method):
+    point, batches = BOUNDS[:, 0] + 0.1 * np.ptp(BOUNDS, axis=1), []
+    settings = {"method": method, "begin": point, "population": 40}
+
+    def value(x):
+        batches.append(x)
+        return -np.abs(x[:, 0] - point[0])
+
+    found = search(value, BOUNDS, n_evaluations=100, **settings)
+    np.testing.assert_array_equal(batches[0][0], point)
+    assert list(map(len, batches)) == [41, 40, 19]
+    np.testing.assert_array_equal(found.params, point)
+    if method != "random":
+        place = (batches[0] - BOUNDS[:, 0]) / np.ptp(BOUNDS, axis=1)
+        assert place.mean() < 0.35
+        # it learns from its own draws: a step of the search is another one than at random
+        exact = search(quadratic(BEST, BOUNDS), BOUNDS, n_evaluations=800, **settings)
+        assert exact.value > -1e-3
+    assert search(value, BOUNDS, n_evaluations=1, **settings).n_evaluations == 1
+    with pytest.raises(ValueError, match="not within the bounds"):
+        search(value, BOUNDS, n_evaluations=9, **(settings | {"begin": BOUNDS[:, 1] + 1.0}))
+
+
 @pytest.mark.parametrize("method", ["cma", "cem"])
 def test_a_search_begins_at_the_start(method):
     found = [

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import BaseEstimator, clone
+from sklearn.exceptions import NotFittedError
 from sklearn.frozen import FrozenEstimator
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
@@ -34,7 +35,7 @@ from trajlearn import (
 )
 from trajlearn.control.policy_search import PolicySearch
 from trajlearn.control.random_search import RandomSearch
-from trajlearn.exceptions import NoUncertaintyError, UnsafeProposalError
+from trajlearn.exceptions import HorizonWarning, NoUncertaintyError, UnsafeProposalError
 
 START = (1.0, -1.0)
 
@@ -270,6 +271,13 @@ def test_objective_and_kappa():
         found = proposed(model, objective="lcb", kappa=kappa, n_evaluations=600)
         assert_allclose(found[0], ends[-1], atol=2e-2)
     assert min(np.diff([1.0, *ends])) > 0.005
+    # the mean of all returns, whatever kappa
+    for optimizer in ("cma", "random"):
+        settings = {"optimizer": optimizer, "n_evaluations": 100}
+        assert_array_equal(
+            proposed(model, objective="expected", kappa=2.0, **settings),
+            proposed(model, objective="lcb", kappa=0.0, **settings),
+        )
     with pytest.raises(NoUncertaintyError):
         proposed(linear(), objective="lcb")
 
@@ -303,7 +311,8 @@ def test_the_member_is_the_one_that_judges(monkeypatch):
     from trajlearn.control import policy_search as module
 
     monkeypatch.setattr(module, "n_members", lambda model: 2)
-    monkeypatch.setattr(module, "member_of", lambda model, i: Believed(shift=[0.4, -0.3][i]))
+    members = [Believed(shift=shift).fit(None) for shift in (0.4, -0.3)]
+    monkeypatch.setattr(module, "member_of", lambda model, i: members[i])
     settings = {"objective": "thompson", "n_evaluations": 600}
     found = [proposed(random_state=seed, **settings) for seed in range(8)]
     ends = {round(float(gains[0]), 1) for gains in found}
@@ -539,6 +548,58 @@ def test_references_and_context_of_the_next_trial_are_those_of_the_last():
     assert_allclose(phase, 0.5)
 
 
+def at_time(trial, start, **more):
+    return Trajectory(
+        trial.states,
+        actions=trial.actions,
+        params=trial.params,
+        times=start + 0.1 * np.arange(len(trial.states)),
+        terminated=trial.terminated,
+        **more,
+    )
+
+
+def test_clocks_of_trials_are_those_of_predictions():
+    search = search_of(linear(), reward=lambda states, times: states[..., 0] * times, n_initial=2)
+    search.tell([at_time(fly(gains), 50.0) for gains in ([0.3, 0.3], [0.6, 0.4])])
+    predicted = search.predict_return([[0.3, 0.3], [0.6, 0.4]])
+    assert_allclose(predicted.reward, search.returns_)
+
+
+def test_without_the_references_of_a_whole_trial_sobol_points_go_on():
+    def tracking(gains):
+        trial = fly(gains)
+        return at_time(trial, 0.0, references=np.zeros((len(trial.states), 1)))
+
+    class Tracking(Believed):
+        def predict_trajectory(self, *args, references, **kwargs):
+            return super().predict_trajectory(*args, **kwargs)
+
+    search = search_of(Tracking()).tell(tracking([5.0, 0.5]))
+    assert search.trials_.lengths[0] < HORIZON
+    with pytest.raises(ValueError, match="references of the next one are unknown"):
+        search.predict_return([[0.3, 0.3]])
+    gains = search.ask()
+    assert_array_equal(gains, search_of().ask())
+    search.tell(tracking(gains)).ask()
+    assert search.tell(tracking(search.ask())).history()["source"].tolist() == [
+        "logged",
+        "sobol",
+        "model",
+    ]
+
+
+def test_what_holds_of_all_forecasts_is_said_once():
+    model = TrajectoryRegressor(random_state=0).set_params(
+        estimator__max_steps=3, estimator__n_members=2
+    )
+    search = search_of(model, n_evaluations=70).tell(fly([5.0, 0.5]))
+    for call in (search.ask, lambda: search.predict_return([[0.3, 0.3], [0.5, 0.5]])):
+        with pytest.warns(HorizonWarning) as said:
+            call()
+        assert [each.category for each in said] == [HorizonWarning]
+
+
 # -- errors leave the search as it was ------------------------------------------------------------
 
 
@@ -612,6 +673,12 @@ def test_what_cannot_go_together_is_named():
         proposed(DirectRewardGP(random_state=0), [[0.3, 0.3], [0.6, 0.6]], constraint=positive)
     with pytest.raises(ValueError, match="model"):
         search_of(object()).ask()
+    # before a trial is run
+    for objective in ("expected", "lcb"):
+        with pytest.raises(ValueError, match=f"cannot follow objective='{objective}'"):
+            search_of(optimizer="gradient", objective=objective).ask()
+    with pytest.raises(NotFittedError):
+        search_of(FrozenEstimator(linear()), n_initial=0, initial_states=[1.0, 1.0]).ask()
 
 
 def test_a_clone_starts_anew():

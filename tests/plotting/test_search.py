@@ -245,7 +245,7 @@ def test_a_wrong_number_of_axes_is_refused():
 
 def test_a_search_without_a_model_has_no_slices():
     search = RandomSearch(bounds=[[0, 1]], reward=lambda s: -s[..., 0], horizon=3)
-    with pytest.raises(TypeError, match="RandomSearch has no model .* use plot_search"):
+    with pytest.raises(TypeError, match=r"RandomSearch has no model .* use plot_search"):
         plot_slices(search.tell(trial_of(0.3)))
 
 

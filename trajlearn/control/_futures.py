@@ -167,14 +167,20 @@ def ask_reward(
 
 
 def reference_function(
-    references: ArrayLike | Callable[[Floats], ArrayLike], dt: float, horizon: int
+    references: ArrayLike | Callable[[Floats], ArrayLike],
+    dt: float,
+    horizon: int,
+    start_time: float,
 ) -> References:
     """References as a function of time, from a function or from values at each step.
+
+    Values count from `start_time`.
 
     Raises
     ------
     ValueError
-        If there is not a row for each step from the initial state on.
+        If there is not a row for each step from the initial state on; when called, if the times
+        are beyond the rows.
     """
     if callable(references):
         function = references
@@ -186,8 +192,18 @@ def reference_function(
             f"({horizon + 1} or more, d_r): one row a step, that of the initial state first; or "
             "a callable of times."
         )
-    times = dt * np.arange(len(values))
-    return lambda at: np.stack([np.interp(at, times, column) for column in values.T], axis=1)
+    times = start_time + dt * np.arange(len(values))
+
+    def interpolated(at: Floats) -> Floats:
+        if at.max() > times[-1] + 1e-6 * dt or at.min() < times[0] - 1e-6 * dt:
+            raise ValueError(
+                f"references has {len(values)} rows, from time {times[0]:g} to {times[-1]:g}, but "
+                f"is needed from {at.min():g} to {at.max():g}: give more rows, or a callable of "
+                "times."
+            )
+        return np.stack([np.interp(at, times, column) for column in values.T], axis=1)
+
+    return interpolated
 
 
 def later(policy: Any, references: References | None, start_time: float) -> tuple[Any, Any]:

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sklearn.utils.validation import check_is_fitted
 
 from trajlearn.control._futures import predicts_rewards
 from trajlearn.dynamics._members import unwrapped
@@ -78,8 +79,11 @@ def check_answerable(
 
     Raises
     ------
+    NotFittedError
     ValueError
     """
+    if hasattr(model, "fit"):
+        check_is_fitted(unwrapped(model))
     name = type(unwrapped(model)).__name__
     if predicts_rewards(model):
         if constrained or decision == "actions":

@@ -86,6 +86,7 @@ def maximise(
     n_evaluations: int,
     rng: np.random.Generator,
     start: ArrayLike | None = None,
+    begin: ArrayLike | None = None,
     population: int | None = None,
     on_batch: Callable[[Floats, Floats], object] | None = None,
 ) -> Found:
@@ -105,7 +106,9 @@ def maximise(
     rng : Generator
     start : array-like of shape (d,) or (k, d), optional
         Evaluated first, so that what is found is never worse; CMA-ES and CEM begin at the best.
-        A single point (d,) is evaluated in one batch with the first draws around it.
+    begin : array-like of shape (d,), optional
+        Where CMA-ES and CEM begin, whatever it is worth: evaluated in one batch with the first
+        draws around it, for functions that take as long for one candidate as for many.
     population : int, optional
         Candidates a batch. None: 32 for CMA-ES, 64 for CEM, 256 for random search.
     on_batch : callable, optional
@@ -151,23 +154,22 @@ def maximise(
         return values
 
     sampler = sampler_of(len(box), size, rng)
-    waiting, waiting_points = np.empty((0, len(box))), np.empty((0, len(box)))
     if start is not None:
         first = checked_start(start, box)[:n_evaluations]
-        points = np.clip((first - low) / width, 0.0, 1.0)
-        if np.ndim(start) == 1:
-            sampler.begin(points[0])
-            waiting, waiting_points = first, points
-        else:
-            sampler.tell(points, evaluate(first))
+        sampler.tell(np.clip((first - low) / width, 0.0, 1.0), evaluate(first))
+    waiting = np.empty((0, len(box)))
+    if begin is not None:
+        waiting = checked_start(begin, box)[:1]
+        sampler.begin(np.clip((waiting[0] - low) / width, 0.0, 1.0))
     while (left := n_evaluations - best.n_evaluations) > 0:
         points = sampler.ask()[: left - len(waiting)]
         # rounding must not carry a candidate over a bound
         drawn = np.clip(low + points * width, box[:, 0], box[:, 1])
         values = evaluate(np.concatenate([waiting, drawn]))
         if len(values) < left:
-            sampler.tell(np.concatenate([waiting_points, points]), values)
-        waiting, waiting_points = waiting[:0], waiting_points[:0]
+            first = np.clip((waiting - low) / width, 0.0, 1.0)
+            sampler.tell(np.concatenate([first, points]), values)
+        waiting = waiting[:0]
     return best
 
 
@@ -217,11 +219,11 @@ class _CrossEntropy:
         self._begin()
 
     def begin(self, point: Floats) -> None:
-        self._mean = point
+        self._begin(point)
 
-    def _begin(self) -> None:
+    def _begin(self, point: Floats | None = None) -> None:
         d = self._shape[1]
-        self._mean: Floats | None = None
+        self._mean = point
         self._std = np.full(d, _WIDTH)
         self._elite: Floats = np.empty((0, d))
         self._elite_values: Floats = np.empty(0)

@@ -147,6 +147,7 @@ class Planner(BaseEstimator):
             start_time=time,
             random_state=int(rng.integers(2**31)),
         )
+        start, warm = self._start(self._before(session, shape), box, rng)
         guarded = Guarded(assess, self.max_violation, shape)
         with warnings.catch_warnings():
             if session.rows:
@@ -159,7 +160,8 @@ class Planner(BaseEstimator):
                 method=self.optimizer,
                 n_evaluations=self.n_candidates,
                 rng=rng,
-                start=self._start(self._before(session, shape), box, rng),
+                start=start,
+                begin=warm,
             )
         if guarded.best is None:
             raise ValueError(
@@ -178,16 +180,19 @@ class Planner(BaseEstimator):
         session.decided(plan)
         return plan
 
-    def _start(self, before: Floats | None, box: Floats, rng: np.random.Generator) -> Floats | None:
-        """Candidates to begin with: the decision before (d,), and all random ones (k, d)."""
+    def _start(
+        self, before: Floats | None, box: Floats, rng: np.random.Generator
+    ) -> tuple[Floats | None, Floats | None]:
+        """`start` and `begin` of `maximise`: the decision before, and all random candidates.
+
+        They are in one batch, as a roll-out of one takes hardly less time than that of many.
+        """
         warm = None if before is None else np.clip(before, *box.T)
         if self.optimizer != "random":
-            return warm
-        # one batch, as a roll-out of one candidate takes hardly less time than that of many
-        fresh = rng.uniform(
-            box[:, 0], box[:, 1], size=(self.n_candidates - (warm is not None), len(box))
-        )
-        return fresh if warm is None else np.concatenate([warm[None], fresh])
+            return None, warm
+        n_fresh = self.n_candidates - (warm is not None)
+        fresh = rng.uniform(box[:, 0], box[:, 1], size=(n_fresh, len(box)))
+        return fresh if warm is None else np.concatenate([warm[None], fresh]), None
 
     def _before(self, session: Session, shape: tuple[int, ...]) -> Floats | None:
         """The decision before as a candidate (d,): actions moved on, the last one repeated."""

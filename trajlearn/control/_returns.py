@@ -88,9 +88,7 @@ class Returns:
     is_terminal: States | None
     terminal_reward: float
 
-    def lived(
-        self, states: Floats, gone: Flags | None
-    ) -> tuple[Floats, NDArray[np.intp], Flags]:
+    def lived(self, states: Floats, gone: Flags | None) -> tuple[Floats, NDArray[np.intp], Flags]:
         """States, how many horizons a trajectory earns at, and whether the last is an end.
 
         Parameters

@@ -12,8 +12,8 @@ Floats = NDArray[np.float64]
 
 # more than the logarithm of any float
 _BELOW = 1e3
-# less than two shares of violation differ, divided by that logarithm
-_TIE = 1e-6
+# so that values weigh less than a difference of violations, of 1 / 50,000 or more
+_TIE = 1e-5
 
 
 def ranked(value: Floats, violation: Floats | None, limit: float) -> Floats:

@@ -68,11 +68,12 @@ class MPC(Planner):
     terminal_reward : float or None, default=None
         What each step after a predicted end, or divergence, earns; `is_terminal` needs it, or
         ending early might pay.
-    risk : {"mean", "lcb"}, default="mean"
-        Maximise the predicted return, or its mean less `kappa` standard deviations.
+    risk : {"mean", "expected", "lcb"}, default="mean"
+        Maximise the return of the mean trajectory, the mean return of sampled trajectories, or
+        that less `kappa` standard deviations; see the Notes.
     kappa : float, default=1.0
     n_samples : int, default=20
-        Trajectories drawn for each candidate, where the spread or the constraint needs some.
+        Trajectories drawn for each candidate, for "expected", "lcb" and a constraint.
     constraint : callable or None, default=None
         ``constraint(states (..., d_s)) -> bool (...)``, True where the state is allowed.
     max_violation : float, default=0.05
@@ -103,6 +104,11 @@ class MPC(Planner):
     A candidate's theta is meant to stay as it is for all of the horizon. Data from a trial in
     which it changed are still data: `run` logs theta_t at each step, and `SubtrajectoryRelabeler`
     draws from stretches in which it is constant. With ``hold=1`` these are single steps.
+
+    ``risk="mean"`` is the fastest and usually enough with a short `hold`, as the next decision
+    mends the last. Where an unstable system may fall to either side within the horizon, the mean
+    trajectory stays upright, and "mean" over-rates candidates that fall; "expected" does not, for
+    `n_samples` times the trajectories.
 
     scikit-learn's `clone` of a planner has an unfitted model, unless that is in a
     `FrozenEstimator`.

@@ -128,7 +128,8 @@ class PredictedReturn:
         ``policy(states, params, times) -> actions``, for one-step models (None: their own) and
         for a reward that names `actions`.
     references : array-like or callable, optional
-        ``references(times (n,)) -> (n, d_r)``, or values of shape (horizon + 1, d_r).
+        ``references(times (n,)) -> (n, d_r)``, or values of shape (horizon + 1, d_r), a row a
+        step from `start_time` on; more rows if `starting_at` a later time is to follow.
     context : mapping from name to value, optional
     phase : float, optional
         Time since `time_origin` at the start.
@@ -151,6 +152,8 @@ class PredictedReturn:
 
     Raises
     ------
+    NotFittedError
+        If the model is not fitted.
     ValueError
         If a parameter is wrong; when called, if candidates have another shape, or a reward is
         NaN.
@@ -231,7 +234,9 @@ class PredictedReturn:
         self.policy = getattr(unwrapped(model), "policy", None) if policy is None else policy
         self.references = None
         if references is not None:
-            self.references = reference_function(references, self.dt, self.horizon)
+            self.references = reference_function(
+                references, self.dt, self.horizon, float(start_time)
+            )
         self.context, self.phase = dict(context or {}), phase
         self._state_names = None if state_names is None else tuple(state_names)
         self._seed = int(generator(random_state).integers(2**62))

@@ -8,10 +8,12 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.frozen import FrozenEstimator
 
 from trajlearn._sklearn import HasMethods, Interval, StrOptions
+from trajlearn.control._each_once import each_once
 from trajlearn.control._futures import predicts_rewards
 from trajlearn.control._optimizers import METHODS, maximise
 from trajlearn.control._safe_set import best_to_worst, ranked
-from trajlearn.control.objective import Assessment, PredictedReturn
+from trajlearn.control._trials import Trials
+from trajlearn.control.objective import RISKS, Assessment, PredictedReturn
 from trajlearn.control.search import Proposal, Search
 from trajlearn.dynamics._learner import seeded
 from trajlearn.dynamics._members import member_of, n_members
@@ -52,22 +54,25 @@ class PolicySearch(Search):
     horizon : int
         Steps of a trial.
     optimizer : {"cma", "cem", "random", "gradient"}, default="cma"
-        How the predicted return is maximised; see `trajlearn.control.maximise`. ``"gradient"``
-        follows the gradient of a `TrajectoryRegressor` in theta from many starts at once.
+        How the predicted return is maximised: CMA-ES, the cross-entropy method, uniform draws,
+        or the gradient of a `TrajectoryRegressor` in theta, from many starts at once.
+        ``"gradient"`` is for the objectives "mean" and "thompson".
     n_initial : int, default=1
         Trials told before the model proposes; until then a scrambled Sobol sequence does. 0 is
         possible with a frozen model and `initial_states`.
     initial_states : array-like of shape (d_s,) or (n0, d_s), optional
         First states over which the predicted return is averaged. Default: those of all trials.
-    objective : {"mean", "lcb", "thompson"}, default="mean"
-        What is maximised: the predicted return; its lower confidence bound
-        ``mean - kappa * std``; or the predicted return of one ensemble member, drawn anew for
-        each proposal.
+    objective : {"mean", "expected", "lcb", "thompson"}, default="mean"
+        What is maximised: the return of the mean trajectory; the mean return of sampled
+        trajectories; their lower confidence bound ``expected - kappa * std``; or the return of
+        the mean trajectory of one ensemble member, drawn anew for each proposal. Choose
+        "expected" where trials may go either way, see the Notes.
     kappa : float, default=1.0
-        Standard deviations that ``"lcb"`` subtracts.
+        Standard deviations that ``"lcb"`` subtracts; with 0 it is ``"expected"``.
     n_samples : int, default=20
-        Sampled trajectories a candidate, where a standard deviation or a violation needs them;
-        what is proposed under a `constraint` is confirmed by four times as many others.
+        Sampled trajectories a candidate, where ``"expected"``, a standard deviation or a
+        violation needs them; what is proposed under a `constraint` is confirmed by four times as
+        many others.
     is_terminal : callable, optional
         ``is_terminal(states) -> bool``: where a predicted trial ends early.
     terminal_reward : float, optional
@@ -102,6 +107,17 @@ class PolicySearch(Search):
     --------
     BayesianSearch : models the return alone.
     RandomSearch : no model.
+    PredictedReturn : what is maximised.
+
+    Notes
+    -----
+    The return of the mean trajectory, ``objective="mean"``, costs least, and is right where the
+    model is sure of where a trial goes. Where an unstable plant may fall to either side, the mean
+    of both stays upright: "mean" then over-rates controllers that fall, and "expected" does not.
+
+    The next trial is taken to be like the last that ran over the whole horizon: with its
+    references, context, phase and start time. Where trials have references and none ran that long
+    yet, what they would have been is unknown, and Sobol points are asked for.
 
     Examples
     --------
@@ -133,7 +149,7 @@ class PolicySearch(Search):
         "optimizer": [StrOptions({*METHODS, "gradient"})],
         "n_initial": [Interval(Integral, 0, None, closed="left")],
         "initial_states": ["array-like", None],
-        "objective": [StrOptions({"mean", "lcb", "thompson"})],
+        "objective": [StrOptions({*RISKS, "thompson"})],
         "kappa": [Interval(Real, 0, None, closed="left")],
         "n_samples": [Interval(Integral, 1, None, closed="left")],
         "is_terminal": [callable, None],
@@ -187,6 +203,16 @@ class PolicySearch(Search):
         self.random_state = random_state
         self.verbose = verbose
 
+    def _validate_params(self) -> None:
+        super()._validate_params()
+        if self.optimizer == "gradient" and self.objective in ("expected", "lcb"):
+            # said before a trial is run
+            raise ValueError(
+                f"optimizer='gradient' cannot follow objective={self.objective!r}, which is "
+                "computed from sampled trajectories: choose another optimizer, or 'mean' or "
+                "'thompson'."
+            )
+
     # -- predictions ----------------------------------------------------------------------
 
     def predict_return(self, params: ArrayLike) -> Assessment:
@@ -216,7 +242,8 @@ class PolicySearch(Search):
         if not np.isfinite(candidates).all():
             raise ValueError("params has NaN or infinite values.")
         seed = int(self._rng(len(state), _PREDICT).integers(2**31))
-        return self._assess(self._fitted(), candidates, seed)
+        with each_once():
+            return self._assess(self._fitted(), candidates, seed)
 
     def _assess(self, model: Any, candidates: Floats, seed: int) -> Assessment:
         """Assessment of few candidates, with a standard deviation if the model gives any."""
@@ -249,17 +276,22 @@ class PolicySearch(Search):
                 "measured in any: give terminal_reward=."
             )
         if data is not None:
-            # the next trial is run like the last one that went to the end
+            if not _future_known(state):
+                raise ValueError(
+                    f"no trial ran over the horizon of {state.horizon} steps yet, so the "
+                    "references of the next one are unknown: tell one that did."
+                )
             whole = np.flatnonzero(data.lengths >= state.horizon)
             last = data[int(whole[-1]) if len(whole) else -1]
             settings = {"dt": uniform_step(data), "state_names": data.state_names}
+            settings["start_time"] = float(last.times[0])
             settings["context"] = dict(last.context)
             if last.references is not None:
                 settings["references"] = last.references
             if not np.isnan(last.time_origin):
                 settings["phase"] = last.times[0] - last.time_origin
         if risk is None:
-            risk = "lcb" if self.objective == "lcb" else "mean"
+            risk = "mean" if self.objective == "thompson" else self.objective
         return PredictedReturn(
             model,
             # direct reward models need none
@@ -334,7 +366,10 @@ class PolicySearch(Search):
         )
 
     def _ready(self) -> bool:
-        if len(self._told()) < self.n_initial:
+        state = self._told()
+        if len(state) < self.n_initial:
+            return False
+        if not _future_known(state):
             return False
         if isinstance(self.model, FrozenEstimator):
             return True
@@ -343,9 +378,10 @@ class PolicySearch(Search):
     # -- proposals ------------------------------------------------------------------------
 
     def _propose(self, rng: np.random.Generator) -> Proposal:
-        model = self._fitted()
-        params, seed = self._maximum(model, rng)
-        found = self._assess(model, params[None], seed)
+        with each_once():
+            model = self._fitted()
+            params, seed = self._maximum(model, rng)
+            found = self._assess(model, params[None], seed)
         violation = None if found.violation is None else float(found.violation[0])
         if violation is not None and not violation <= self.max_violation:
             raise UnsafeProposalError(
@@ -412,13 +448,12 @@ class PolicySearch(Search):
         self, model: Any, seed: int, own: PredictedReturn | None, *, copies: int = 1
     ) -> "Callable[[Floats], Floats]":
         """Values of candidates, those that violate the constraint too often below all others."""
-        guard, scale = self._objective(model, seed, copies=copies), self._scale()
+        guard = self._objective(model, seed, copies=copies)
 
         def rank(params: Floats) -> Floats:
             found = guard(params)
-            assert found.violation is not None
             wanted = found.value if own is None else own(params).value
-            return ranked(wanted, found.violation, self.max_violation, scale)
+            return ranked(wanted, found.violation, self.max_violation)
 
         return rank
 
@@ -435,10 +470,11 @@ class PolicySearch(Search):
             return None
         return np.clip(np.unique(points, axis=0), *state.bounds.T)
 
-    def _scale(self) -> float:
-        """A typical size of returns."""
-        returns = np.abs(self._tried()[1])
-        return float(returns.max(initial=0.0)) or 1.0
+
+def _future_known(state: Trials) -> bool:
+    """Whether the references of the next trial are known, if it has any."""
+    data = state.data
+    return data is None or data.references is None or bool(data.lengths.max() >= state.horizon)
 
 
 def _unknown(states: Floats) -> Floats:

@@ -114,7 +114,8 @@ def plot_search(search: _Search, ax: "Axes | None" = None) -> "Axes":
         )
     ax.set_xlabel("trial")
     ax.set_ylabel("return")
-    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
+    ax.set_xlim(number[0] - 0.5, number[-1] + 0.5)
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     ax.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=3, frameon=False, fontsize="small")
     tidy(ax)
     return ax
