@@ -570,6 +570,18 @@ def test_all_candidates_get_the_same_numbers(name, monkeypatch):
     assert (other(THETA).value != found.value[:3]).all()
 
 
+def test_the_doubt_about_the_plant_does_not_average_out_over_starts():
+    model = MODELS["one-step"]().fit(drifting(6))
+    # members that differ, without noise of their own
+    model.estimator_.residual_std_[:] = 0.0
+    few, many = (
+        objective(model, risk="expected", n_samples=40, initial_states=starts, random_state=0)
+        for starts in (STARTS[:1], np.repeat(STARTS[:1], 16, axis=0))
+    )
+    assert (few(THETA).std > 0).all()
+    np.testing.assert_allclose(many(THETA).std, few(THETA).std, rtol=1e-6)
+
+
 def test_chunks_change_nothing(ensemble, monkeypatch):
     theta = np.random.default_rng(0).uniform(-1, 1, (50, 1))
     whole = objective(ensemble)(theta).value

@@ -39,16 +39,20 @@ class CommonNumbers(np.random.Generator):
     def integers(  # type: ignore[override]
         self, low: Any, high: Any = None, size: Any = None, **kwargs: Any
     ) -> Any:
-        """As of any generator."""
+        """As of any generator, but the same at all initial states.
+
+        An integer is the ensemble member that a trajectory follows: what the plant might be does
+        not depend on where a trial starts, so that its doubt does not average out over starts.
+        """
         draw = super().integers
-        return self._shared(size, lambda shape: draw(low, high, shape, **kwargs))
+        return self._shared(size, lambda shape: draw(low, high, shape, **kwargs), by_start=False)
 
     def spawn(self, n_children: int) -> "list[Any]":
         """As of any generator; children repeat their draws, too."""
         seeds: Any = self.bit_generator.seed_seq
         return [CommonNumbers(seed, *self._sizes) for seed in seeds.spawn(n_children)]
 
-    def _shared(self, size: Any, draw: Any) -> Any:
+    def _shared(self, size: Any, draw: Any, *, by_start: bool = True) -> Any:
         copies, rows, starts = self._sizes
         shape = tuple(np.atleast_1d(size)) if size is not None else ()
         if shape[:1] == (copies * rows,):
@@ -57,7 +61,7 @@ class CommonNumbers(np.random.Generator):
             rest, flat = shape[2:], False
         else:
             return draw(size)
-        one = draw((copies, 1, starts, *rest))
+        one = draw((copies, 1, starts if by_start else 1, *rest))
         # a copy: models write into their noise
         every = np.array(np.broadcast_to(one, (copies, rows // starts, starts, *rest)))
         return every.reshape(copies * rows, *rest) if flat else every.reshape(copies, rows, *rest)
