@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks._results import read_json
 from benchmarks.paper._command import read_tables
+from benchmarks.paper._iterative_tables import result
 from benchmarks.paper._reward_page import brief
 
 ROOT = Path(__file__).parent.parent
@@ -29,6 +30,22 @@ def test_a_reward_table_is_the_committed_one(task):
     expected = brief(task, read_tables(ROOT / REWARDS, task)[task])
     assert expected in README, f"README.md needs this table:\n{expected}"
     assert f"{REWARDS}/{task}.png" in README
+
+
+SEARCHES = {"T, distilled from it": "T, distilled", "T, from the trials alone": "T"}
+
+
+def test_the_table_of_searches_is_the_committed_one():
+    folder = ROOT / "benchmarks/paper/results/iterative-learning"
+    assert read_json(folder / "cartpole.json")["mode"] == "full"
+    found = result(read_tables(folder, "cartpole"))
+    head = "| method | trial 1 | trial 2 | trial 3 | trial 5 | trial 10 |"
+    rows = README[README.index(head) :].split("\n\n")[0].splitlines()[2:]
+    assert len(rows) >= 5
+    for row in rows:
+        name, *numbers = [cell.strip() for cell in row.strip("|").split("|")]
+        median = found.by_trial(SEARCHES.get(name, name), "best_true").median()
+        assert numbers == [f"{median[trial]:.3f}" for trial in (1, 2, 3, 5, 10)], name
 
 
 @pytest.mark.parametrize("command", ["make table", "make test"])

@@ -18,7 +18,7 @@ PANELS = {
     "best_seen": "as seen in the trials",
 }
 _SHADED = [BO, DISTILLED]
-_MARKERS = "oDs^vP*X+"
+_MARKERS = "oDs^vP*XH+"
 
 
 def draw(tables: Tables) -> "dict[str, Figure]":

@@ -30,6 +30,8 @@ Floats = NDArray[np.float64]
 DISTILLED, GRADIENTS = "T, distilled", "T, distilled, by gradients"
 LINEAR = "D, linear"
 BO, RANDOM = "Bayesian optimisation", "random"
+#: A usual way to begin Bayesian optimisation, which else tries the corners of the box first.
+BO_LATER, N_SOBOL = "Bayesian optimisation, 5 Sobol points first", 5
 #: What is compared, in the order in which it is shown, and what each learns from.
 METHODS = {
     DISTILLED: "T, from the trials and from what a one-step model imagines; CMA-ES",
@@ -40,6 +42,7 @@ METHODS = {
     LINEAR: "one-step linear regression, actions recomputed; CMA-ES",
     "direct GP": "Gaussian process from (s_0, theta) to the return; CMA-ES on its mean",
     BO: "Gaussian process from theta to the return; log expected improvement",
+    BO_LATER: "the same after four more Sobol points, those of random",
     RANDOM: "Sobol points",
 }
 #: Methods that plan with a trajectory model.
@@ -136,8 +139,8 @@ def search(method: str, task: ControlTask, mode: str, repeat: int, planned: Floa
     }
     if method == RANDOM:
         return RandomSearch(**shared)
-    if method == BO:
-        return BayesianSearch(**shared)
+    if method in (BO, BO_LATER):
+        return BayesianSearch(**shared, n_initial=N_SOBOL if method == BO_LATER else 1)
     by_gradients, sampled = method == GRADIENTS, method in (DISTILLED, "T")
     sizes = SIZES[mode]
     budget = sizes["by_gradients"] if by_gradients else sizes["evaluations"][task.name]

@@ -5,6 +5,7 @@ import pandas as pd
 from benchmarks.paper._command import Tables, markdown
 from benchmarks.paper._iterative_methods import (
     BO,
+    BO_LATER,
     DISTILLED,
     METHODS,
     N_PLANNED,
@@ -150,7 +151,7 @@ def _costs(of: Result) -> pd.DataFrame:
         {
             "method": method,
             # Bayesian optimisation fits and searches as one
-            "fit": "" if method == BO else f"{seconds(of, method, 'seconds_fit'):.2g}",
+            "fit": "" if method in (BO, BO_LATER) else f"{seconds(of, method, 'seconds_fit'):.2g}",
             "search": f"{seconds(of, method, 'seconds_search'):.2g}",
             "steps of a trial, mean": f"{_steps(of, method):.0f}",
         }

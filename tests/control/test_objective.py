@@ -697,6 +697,11 @@ def test_a_wrong_setting_is_named(drift, settings, message):
         ({"reward": lambda s: s[..., 0] * np.nan}, [[1.0]], "returned NaN"),
         ({"reward": lambda s: s}, [[1.0]], "one number a state"),
         ({"is_terminal": affine, "terminal_reward": 0.0}, [[1.0]], "is_terminal returned float64"),
+        (
+            {"is_terminal": lambda s: s[2] > 9, "terminal_reward": 0.0},
+            [[1.0]],
+            r"is_terminal cannot index.*write states\[..., 0\]",
+        ),
     ],
 )
 def test_a_wrong_candidate_or_function_is_named(drift, settings, candidates, message):

@@ -165,7 +165,13 @@ def flags(ask: States, states: Floats, name: str) -> Flags:
     ValueError
         If it does not give one truth value a state.
     """
-    answers = np.asarray(ask(states))
+    try:
+        answers = np.asarray(ask(states))
+    except IndexError as error:
+        raise ValueError(
+            f"{name} cannot index states of shape {states.shape} ({error}): states stand on the "
+            "last axis, so write states[..., 0] for the first."
+        ) from error
     if answers.shape != states.shape[:-1] or answers.dtype != bool:
         raise ValueError(
             f"{name} returned {answers.dtype} of shape {answers.shape} for states of shape "

@@ -96,7 +96,8 @@ class PolicySearch(Search):
     Attributes
     ----------
     model_ : estimator
-        Fitted on all trials told before the last proposal or prediction.
+        Fitted on all trials told before the last proposal or prediction; after `resume` there is
+        none until then.
     trials_ : TrajectoryDataset
     returns_ : ndarray of shape (n,)
     best_params_ : ndarray of shape (p,)
@@ -387,7 +388,8 @@ class PolicySearch(Search):
             raise UnsafeProposalError(
                 f"the least probability of leaving the constraint that was found is "
                 f"{violation:.3g}, above max_violation = {self.max_violation:g}: tell more trials "
-                "near the allowed states, raise max_violation=, or widen bounds= or n_evaluations=."
+                "near the allowed states, raise n_evaluations= or max_violation=, or widen bounds=; "
+                "perhaps no parameters keep the constraint."
             )
         return Proposal(
             params,

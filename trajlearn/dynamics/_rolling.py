@@ -142,8 +142,9 @@ class RollingEstimator(DynamicsEstimator):
             )
         if choice == "logged" and ds.actions is None:
             raise MissingFieldError(
-                f"{type(self).__name__} needs actions to roll out, but the episodes have none. "
-                "Give policy=, or a model with inputs='params'."
+                f"{type(self).__name__} needs actions to roll out, but the episodes (or the plan) "
+                "have none ahead and there is no policy. Give policy=, or a model with "
+                "inputs='params'."
             )
         if choice == "logged":
             self._check_action_width(ds)
