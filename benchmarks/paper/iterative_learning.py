@@ -57,7 +57,7 @@ def settings(mode: str) -> dict[str, Any]:
         name: {
             "task": name,
             "length": task.length,
-            "bounds": task.bounds,
+            "bounds": task.bounds.tolist(),
             "terminal_reward": task.terminal_reward,
             "n_repeats": N_REPEATS[name],
             "n_test_starts": len(task.test_starts),

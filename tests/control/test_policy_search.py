@@ -740,3 +740,20 @@ def test_a_process_killed_between_ask_and_tell_goes_on_as_if_never_stopped(tmp_p
         resumed.tell(fly(gains + 0.1))
         never_stopped.tell(fly(gains + 0.1))
     assert resumed.history().equals(never_stopped.history())
+
+
+def test_predicted_trials_that_never_end_are_warned_of():
+    with pytest.warns(UserWarning, match=r"1 trial\(s\) ended early, but is_terminal=None"):
+        search_of().tell([fly([5.0, 0.5]), fly(OPEN)])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        search_of(is_terminal=fallen, terminal_reward=-9.0).tell(fly([5.0, 0.5]))
+        search_of().tell(fly(OPEN))
+
+
+def test_a_reward_that_only_knows_one_trial_is_refused_before_it_is_told():
+    search = search_of(reward=lambda states: -(states[:, 0] ** 2))
+    with pytest.raises(ValueError, match="one number a state"):
+        search.tell(fly(OPEN))
+    with pytest.raises(AttributeError, match="no trial was told"):
+        _ = search.trials_

@@ -1,5 +1,6 @@
 """What a search has asked for and was told: replaced whole, so that an error changes nothing."""
 
+import warnings
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -12,7 +13,7 @@ from trajlearn.trajectories.edits import concatenate
 from trajlearn.trajectories.rewards import Reward, _logged
 from trajlearn.trajectories.times import uniform_step
 
-__all__ = ["Proposal", "Trials", "joined", "measured"]
+__all__ = ["Proposal", "Trials", "joined", "measured", "warn_of_ends"]
 
 Floats = NDArray[np.float64]
 # fields of a dataset that models do without: dropped where only some trials have them
@@ -138,6 +139,19 @@ def joined(state: Trials, ds: TrajectoryDataset) -> tuple[TrajectoryDataset, Tra
     except ValueError as error:
         error.add_note("The first are the trials told before, number 2 is what is told now.")
         raise
+
+
+def warn_of_ends(ds: TrajectoryDataset, is_terminal: Any, horizon: int) -> None:
+    """Warn where trials ended early, but nothing says where predicted ones do."""
+    early = ds.terminated & (ds.lengths < horizon)
+    if is_terminal is None and early.any():
+        warnings.warn(
+            f"{early.sum()} trial(s) ended early, but is_terminal=None: predicted trials go on to "
+            "the horizon whatever happens. Give is_terminal= and terminal_reward=, so that a "
+            "predicted end costs what a real one does.",
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 def _step_of(ds: TrajectoryDataset) -> float:

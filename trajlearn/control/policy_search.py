@@ -1,5 +1,6 @@
 """Search with a model of the dynamics: what it predicts to be best is tried next."""
 
+from contextlib import suppress
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -12,14 +13,14 @@ from trajlearn.control._each_once import each_once
 from trajlearn.control._futures import predicts_rewards
 from trajlearn.control._optimizers import METHODS, maximise
 from trajlearn.control._safe_set import best_to_worst, ranked
-from trajlearn.control._trials import Trials
+from trajlearn.control._trials import Trials, warn_of_ends
 from trajlearn.control.objective import RISKS, Assessment, PredictedReturn
 from trajlearn.control.search import Proposal, Search
 from trajlearn.dynamics._learner import seeded
 from trajlearn.dynamics._members import member_of, n_members
-from trajlearn.exceptions import NoUncertaintyError, UnsafeProposalError
+from trajlearn.exceptions import MissingFieldError, NoUncertaintyError, UnsafeProposalError
 from trajlearn.trajectories import TrajectoryDataset
-from trajlearn.trajectories.rewards import Reward
+from trajlearn.trajectories.rewards import Reward, step_rewards
 from trajlearn.trajectories.times import uniform_step
 
 if TYPE_CHECKING:
@@ -321,6 +322,12 @@ class PolicySearch(Search):
         return first[:1] if (first == first[0]).all() else first
 
     def _check_trials(self, ds: TrajectoryDataset) -> None:
+        if not predicts_rewards(self.model):
+            if self.reward is not None:
+                # predicted states have an axis more than those of a trial
+                with suppress(MissingFieldError):
+                    step_rewards(self.reward, ds.states[None, 1:2])
+            warn_of_ends(ds, self.is_terminal, self.horizon)
         if self.initial_states is None:
             return
         width = self._initial_states(None).shape[1]
@@ -388,8 +395,8 @@ class PolicySearch(Search):
             raise UnsafeProposalError(
                 f"the least probability of leaving the constraint that was found is "
                 f"{violation:.3g}, above max_violation = {self.max_violation:g}: tell more trials "
-                "near the allowed states, raise n_evaluations= or max_violation=, or widen bounds=; "
-                "perhaps no parameters keep the constraint."
+                "near the allowed states, raise n_evaluations= or max_violation=, or widen "
+                "bounds=; perhaps no parameters keep the constraint."
             )
         return Proposal(
             params,

@@ -89,6 +89,9 @@ def moments_of(learner: Any, *, means_only: bool = False) -> Moments:
         if means_only:
             return lambda rows: (predictor(rows)[..., : len(learner.target_mean_)], None)
         return lambda rows: learner.moments(predictor(rows))
+    if isinstance(learner, MultiOutputRegressor):
+        # it has no return_std itself, though its parts may
+        return _side_by_side([moments_of(e, means_only=means_only) for e in learner.estimators_])
     can = "return_std" in inspect.signature(learner.predict).parameters
     with_std = can and not means_only
 
@@ -99,6 +102,18 @@ def moments_of(learner: Any, *, means_only: bool = False) -> Moments:
             mean, std = learner.predict(rows, return_std=True)
             return _by_target(mean, len(rows)), _by_target(std, len(rows)) ** 2
         return _by_target(learner.predict(rows), len(rows)), None
+
+    return moments
+
+
+def _side_by_side(targets: list[Moments]) -> Moments:
+    """Moments of several targets (E, n, 1) as those of one learner (E, n, d)."""
+
+    def moments(rows: Floats) -> tuple[Floats, Floats | None]:
+        means, variances = zip(*(target(rows) for target in targets))
+        known = [variance for variance in variances if variance is not None]
+        joined = np.concatenate(known, axis=-1) if len(known) == len(targets) else None
+        return np.concatenate(means, axis=-1), joined
 
     return moments
 
