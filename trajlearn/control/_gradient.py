@@ -1,7 +1,7 @@
 """Gradient ascent on the return that a trajectory model predicts: it is differentiable in theta."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -12,7 +12,6 @@ from trajlearn.control._climb import Climb
 from trajlearn.control._futures import Situation
 from trajlearn.control._optimizers import Found, checked_bounds, checked_start
 from trajlearn.control._returns import Returns
-from trajlearn.control.objective import PredictedReturn
 from trajlearn.dynamics._differentiable import differentiable
 from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES
 from trajlearn.dynamics._members import unwrapped
@@ -32,7 +31,15 @@ _LEAST_STEPS = 10
 _FINALISTS = 4
 
 
-def value_and_gradient(objective: PredictedReturn, params: ArrayLike) -> tuple[Floats, Floats]:
+class Climbable(Protocol):
+    """A predicted return that may have a derivative, such as a `PredictedReturn`."""
+
+    def gradient(self) -> "ReturnGradient":
+        """Prepare the derivative, or raise ValueError and say why there is none."""
+        ...
+
+
+def value_and_gradient(objective: Climbable, params: ArrayLike) -> tuple[Floats, Floats]:
     r"""Predicted return of candidates, and its derivative in theta.
 
     .. math:: \nabla_\theta R = \frac1{n_0} \sum_{i, t} w_t
@@ -142,7 +149,7 @@ class ReturnGradient:
 
 
 def ascend(
-    objective: PredictedReturn,
+    objective: Climbable,
     bounds: ArrayLike,
     *,
     n_evaluations: int,
