@@ -214,7 +214,11 @@ class Search(BaseEstimator):
 
     @property
     def best_params_(self) -> Floats:
-        """Params of the trial of greatest return (p,)."""
+        """Params of the trial of greatest return (p,).
+
+        Where trials begin in unlike states, the greatest return may be that of a good start;
+        `predict_return` of a `PolicySearch` judges all params from the same states.
+        """
         params, returns = self._best()
         return params[int(np.argmax(returns))].copy()
 
@@ -241,9 +245,10 @@ class Search(BaseEstimator):
         -------
         DataFrame
             ``trial``; the params by name; ``return``; ``best`` so far; ``predicted``,
-            ``predicted_std`` and ``violation`` of the proposal (NaN where nothing was
-            predicted); ``n_steps``; ``terminated``; ``source`` (``"sobol"``, ``"model"``, ...,
-            ``"logged"`` if the trial did not follow the proposal).
+            ``predicted_std`` and ``violation`` of the proposal, averaged over the initial states
+            that the model was asked about, so that a single trial scatters more (NaN where
+            nothing was predicted); ``n_steps``; ``terminated``; ``source`` (``"sobol"``,
+            ``"model"``, ..., ``"logged"`` if the trial did not follow the proposal).
         """
         import pandas as pd
 
