@@ -85,6 +85,17 @@ def test_the_same_seed_gives_the_same_bits_also_after_resuming(tmp_path):
     assert (run(search_of(random_state=2), 2)[1] != whole[1]).any()
 
 
+def test_other_seeds_agree_on_the_same_trials():
+    """The greatest acquisition is a matter of the trials; only its optimiser has a seed."""
+    rng = np.random.default_rng(0)
+    tried = BOUNDS[:, 0] + rng.random((6, 2)) * (BOUNDS[:, 1] - BOUNDS[:, 0])
+    asked = [
+        search_of(random_state=seed).tell([trial(params) for params in tried]).ask()
+        for seed in (0, 1)
+    ]
+    np.testing.assert_allclose(asked[0], asked[1], rtol=1e-3)
+
+
 def test_torch_is_left_as_it_was():
     search = search_of(random_state=0)
     run(search, 2)
@@ -130,7 +141,7 @@ def test_the_predicted_return_is_that_of_a_trial():
     new = BOUNDS[:, 0] + rng.random((100, 2)) * (BOUNDS[:, 1] - BOUNDS[:, 0])
     found = search.predict_return(new)
     observed = shape(new) + 0.2 * rng.normal(size=100)
-    assert found.value is found.reward
+    assert found.value is found.reward is found.expected
     assert np.sqrt(np.mean((found.reward - shape(new)) ** 2)) < 0.2
     # the std is of what one trial returns, noise included
     assert 0.7 < np.std((observed - found.reward) / found.std) < 1.3
@@ -188,5 +199,5 @@ def test_bad_input_is_named():
     with pytest.raises(AttributeError, match="no trial"):
         search.predict_return([BEST])
     run(search, 1)
-    with pytest.raises(ValueError, match=r"params of shape \(1, 3\)"):
+    with pytest.raises(ValueError, match=r"params has shape \(1, 3\); expected \(m, 2\)"):
         search.predict_return([[0.0, 1.0, 2.0]])

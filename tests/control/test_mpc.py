@@ -489,8 +489,14 @@ def test_model_in_a_pipeline_is_planned_with():
         ({"risk": "max"}, "risk"),
         ({"reward": 3}, "reward"),
         ({"bounds": [[0.0, 1.0]] * 3}, "params"),
-        ({"decision": "actions", "bounds": [[-1.0, 1.0]] * 2}, "2 actions"),
-        ({"decision": "actions", "hold": 21}, "hold = 21 is more than the horizon = 20"),
+        (
+            {"decision": "actions", "bounds": [[-1.0, 1.0]] * 2},
+            r"bounds has 2 rows, but OneStepRegressor was fitted with d_a = 1 actions \(u\)",
+        ),
+        (
+            {"decision": "actions", "bounds": [[-1.0, 1.0]], "hold": 21},
+            "hold = 21 is more than the horizon = 20",
+        ),
         ({"reward": lambda s: np.full(s.shape[:-1], np.nan)}, "NaN"),
         ({"reward": lambda s: np.zeros(3)}, "shape"),
         ({"reward": lambda s: np.full(s.shape[:-1], -np.inf)}, "finite"),
@@ -508,6 +514,21 @@ def test_what_cannot_be_planned_is_said_and_nothing_is_lost(exact, changes, mess
         planner.plan(STARTS[0])
     assert planner.decisions_.equals(before)
     planner.set_params(**{key: good[key] for key in changes}).act(STARTS[0])
+
+
+def test_bounds_of_other_params_than_the_models_are_named(trajectory):
+    message = r"bounds has 3 rows, but TrajectoryRegressor was fitted with p = 2 params \(k_x, k_v"
+    with pytest.raises(ValueError, match=message):
+        mpc(trajectory, bounds=[[0.0, 1.0]] * 3).plan(STARTS[0])
+    # what a pipeline makes of params is its own affair
+    ds = ENV.collect(5, 9, random_state=0)
+    three = ds.assign(params=ds.params[:, [0, 1, 1]])
+    to_gains = make_pipeline(
+        ParamsTransformer(lambda params: params[:, :2]),
+        TrajectoryRegressor(LinearRegression(), random_state=0),
+    ).fit(three)
+    planner = mpc(to_gains, bounds=[[0.0, 1.0]] * 3, dt=ENV.dt, horizon=5, n_candidates=5)
+    assert planner.plan(STARTS[0]).params.shape == (3,)
 
 
 def test_model_must_suit_what_is_decided(exact, trajectory):
@@ -551,7 +572,7 @@ def test_a_run_that_cannot_begin_loses_no_decisions(exact):
 def test_wrong_runs_are_named(exact):
     with pytest.raises(ValueError, match=r"a step of the environment takes 0\.1"):
         mpc(exact, dt=0.2).run(ENV, STARTS, 5)
-    with pytest.raises(ValueError, match="length must be"):
+    with pytest.raises(ValueError, match="length = 0 must be"):
         mpc(exact).run(ENV, STARTS, 0)
     with pytest.raises(ValueError, match="initial_states"):
         mpc(exact).run(ENV, np.zeros((1, 3)), 5)

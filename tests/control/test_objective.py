@@ -341,6 +341,31 @@ def test_a_pipeline_is_asked_through_predict(drift, every):
         np.testing.assert_allclose(found, expected, atol=1e-9)
 
 
+def test_a_one_step_baseline_in_a_pipeline_is_rolled_out_step_by_step():
+    model = TrajectoryRegressor(
+        LinearRegression(),
+        baseline=OneStepRegressor(LinearRegression(), inputs="params"),
+        random_state=0,
+    ).fit(drifting())
+    pipeline = make_pipeline(FunctionTransformer(), model)
+    for every in (1, 5):
+        expected = objective(model, every=every)(THETA).value
+        np.testing.assert_allclose(objective(pipeline, every=every)(THETA).value, expected)
+
+
+def test_std_is_about_the_mean_return_also_where_the_mean_trajectory_is_judged(ensemble):
+    asked = {"reward": square, "constraint": lambda states: states[..., 0] < 9, "n_samples": 5}
+    mean, expected = (
+        objective(ensemble, risk=risk, random_state=0, **asked)(THETA)
+        for risk in ("mean", "expected")
+    )
+    np.testing.assert_array_equal(mean.expected, expected.reward)
+    np.testing.assert_array_equal(mean.std, expected.std)
+    np.testing.assert_array_equal(expected.expected, expected.value)
+    assert (mean.reward != mean.expected).all()
+    assert objective(ensemble, reward=square)(THETA).expected is None
+
+
 def test_a_pipeline_that_selects_states_is_given_all_of_them():
     ds = drifting(d_s=2)
     select = FunctionTransformer(lambda ds: ds.select_states(["s1"]))

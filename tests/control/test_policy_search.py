@@ -466,6 +466,36 @@ def test_the_model_is_cloned_and_fitted_on_all_trials():
     assert len(search.model_.fitted_on_) == 4
 
 
+def test_the_model_is_there_at_once_after_resuming(tmp_path):
+    search = told(search_of(linear(), n_initial=2), 3)
+    search.ask()
+    search.save(tmp_path / "search.npz")
+    resumed = search_of(linear(), n_initial=2)
+    assert not hasattr(resumed, "model_")
+    resumed.resume(tmp_path / "search.npz")
+    assert_array_equal(
+        resumed.model_.predict(search.trials_).mean, search.model_.predict(search.trials_).mean
+    )
+    # until something new is asked, it is the model of what was asked
+    before = resumed.model_
+    resumed.tell(fly([0.2, 0.2]))
+    assert resumed.model_ is before
+    # a file of other trials has another model
+    other = told(search_of(linear(), n_initial=2), 1)
+    other.save(tmp_path / "other.npz")
+    resumed.resume(tmp_path / "other.npz")
+    assert resumed.model_ is not before
+    assert not hasattr(search_of(linear(), random_state=1).resume(nothing(tmp_path)), "model_")
+    frozen = FrozenEstimator(linear().fit(search.trials_))
+    assert search_of(frozen, n_initial=0).model_ is frozen.estimator
+
+
+def nothing(folder):
+    """A file of a search that was told nothing."""
+    search_of(random_state=1).save(folder / "nothing.npz")
+    return folder / "nothing.npz"
+
+
 def test_a_frozen_model_is_taken_as_it_is():
     logged = TrajectoryDataset([fly([0.3, 0.3]), fly([1.5, 1.2])])
     model = linear().fit(logged)
@@ -499,6 +529,31 @@ def test_predict_return():
     for wrong, message in [([[0.3]], "expected"), ([[0.3, np.nan]], "NaN")]:
         with pytest.raises(ValueError, match=message):
             search.predict_return(wrong)
+
+
+def test_std_is_about_the_expected_return_whatever_is_maximised():
+    model = Believed(doubt=0.3, members=(0.0, 1.0, 2.0))
+    found = {
+        objective: search_of(model, objective=objective, n_samples=3)
+        .tell(fly([0.3, 0.3]))
+        .predict_return([[0.3, 0.3], [0.9, 0.4]])
+        for objective in ("mean", "expected")
+    }
+    mean, expected = found["mean"], found["expected"]
+    assert (mean.reward - mean.expected > 0.05).all()
+    assert_array_equal(mean.value, mean.reward)
+    assert_allclose(mean.expected, expected.reward)
+    assert_allclose(mean.std, expected.std)
+    assert_array_equal(expected.expected, expected.reward)
+    assert search_of(linear()).tell(fly([0.3, 0.3])).predict_return([0.3, 0.3]).expected is None
+    # and so in the table
+    search = search_of(model, n_samples=3).tell(fly([0.3, 0.3]))
+    row = search.tell(fly(search.ask())).history().iloc[-1]
+    # samples of one seed: the same three members
+    assert_allclose(
+        row["expected"], search.predict_return(search.trials_.params[1]).expected, rtol=1e-6
+    )
+    assert row["predicted"] > row["expected"]
 
 
 def test_start_points_are_the_best_trial_and_the_last_proposal(tmp_path):
@@ -673,6 +728,10 @@ def test_what_cannot_go_together_is_named():
         proposed(DirectRewardGP(random_state=0), [[0.3, 0.3], [0.6, 0.6]], constraint=positive)
     with pytest.raises(ValueError, match="model"):
         search_of(object()).ask()
+    for call in (lambda s: s.ask(), lambda s: s.tell(fly([0.3, 0.3]))):
+        message = r"model = OneStepRegressor is a class: give an estimator, model = OneStepReg"
+        with pytest.raises(ValueError, match=message):
+            call(search_of(OneStepRegressor))
     # before a trial is run
     for objective in ("expected", "lcb"):
         with pytest.raises(ValueError, match=f"cannot follow objective='{objective}'"):
@@ -715,24 +774,12 @@ def test_crashes_in_a_simulator_are_data():
     assert table["return"][4:].max() > table["return"][:4].max()
 
 
-CHILD = """
-    import sys, time
-    from tests.control.plants import fly, tuned_by_a_model
-
-    search = tuned_by_a_model(random_state=0)
-    for _ in range(3):
-        search.tell(fly(search.ask()))
-    search.ask()
-    search.save(sys.argv[1])
-    print("asked", flush=True)
-    time.sleep(60)
-"""
-
-
 def test_a_process_killed_between_ask_and_tell_goes_on_as_if_never_stopped(tmp_path):
-    killed_after_ask(CHILD, tmp_path / "search.npz")
+    killed_after_ask(lambda: tuned_by_a_model(random_state=0), tmp_path / "search.npz")
     resumed = tuned_by_a_model(random_state=None).resume(tmp_path / "search.npz")
-    never_stopped = told(tuned_by_a_model(random_state=0), 3)
+    never_stopped = told(tuned_by_a_model(random_state=0), 2)
+    # the proposal that waits is a model's
+    assert not np.array_equal(never_stopped.ask(), search_of(n_initial=3).ask())
     for _ in range(2):
         gains = resumed.ask()
         assert_array_equal(gains, never_stopped.ask())

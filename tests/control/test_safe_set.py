@@ -9,7 +9,7 @@ from scipy.stats import norm
 
 from tests.control.plants import fly
 from tests.control.test_policy_search import Believed, search_of
-from trajlearn.control import policy_search
+from trajlearn.control import _best_params
 from trajlearn.control._optimizers import maximise
 from trajlearn.control._safe_set import Guarded, best_to_worst, ranked
 from trajlearn.exceptions import UnsafeProposalError
@@ -125,6 +125,6 @@ def test_what_is_safe_by_luck_is_judged_by_other_samples(monkeypatch):
     assert violations.mean() < 0.2
     assert violations.max() < 0.35
     # the best by the first samples alone fails in others
-    monkeypatch.setattr(policy_search, "_CONFIRMED", 1)
+    monkeypatch.setattr(_best_params, "_CONFIRMED", 1)
     with pytest.raises(UnsafeProposalError):
         [proposal(seed) for seed in range(10)]

@@ -352,6 +352,7 @@ def test_history_has_one_row_a_trial():
         "return",
         "best",
         "predicted",
+        "expected",
         "predicted_std",
         "violation",
         "n_steps",

@@ -1,9 +1,7 @@
+import multiprocessing
 import os
 import signal
-import subprocess
-import sys
-import textwrap
-from pathlib import Path
+import time
 
 import numpy as np
 import pytest
@@ -13,8 +11,6 @@ from tests.control.plants import BOUNDS, HORIZON, Plant, cost, fly
 from trajlearn import Trajectory
 from trajlearn.control.random_search import RandomSearch
 from trajlearn.exceptions import UnknownFileError
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 def search_of(**settings):
@@ -51,14 +47,19 @@ def test_a_resumed_search_is_the_one_that_was_saved(n, waiting, tmp_path):
     alike(told(again, 2), told(search, 2))
 
 
+def changing():
+    """A trial in which theta changes."""
+    trial = fly([0.3, 0.3])
+    theta = np.linspace(0, 1, HORIZON)[:, None] * [1.0, 0.5]
+    return Trajectory(
+        trial.states, actions=trial.actions, rewards=trial.rewards, params=theta, dt=0.1
+    )
+
+
 def test_crashes_returns_by_hand_and_changing_theta_survive(tmp_path):
     search = search_of().tell(fly([2.9, 0.5], start=(3.0, 0.0)))
     search.tell(fly([0.3, 0.3], length=2), reward=-7.0)
-    trial = fly([0.3, 0.3])
-    theta = np.linspace(0, 1, HORIZON)[:, None] * [1.0, 0.5]
-    search.tell(
-        Trajectory(trial.states, actions=trial.actions, rewards=trial.rewards, params=theta, dt=0.1)
-    )
+    search.tell(changing())
     search.save(tmp_path / "search.npz")
     again = search_of().resume(tmp_path / "search.npz")
     alike(again, search)
@@ -88,6 +89,47 @@ def test_another_search_names_what_differs(tmp_path):
         Other(bounds=BOUNDS, reward=cost, horizon=HORIZON).resume(path)
 
 
+def weighted(states):
+    return 2.0 * cost(states)
+
+
+@pytest.mark.parametrize(
+    ("trials", "what"),
+    [
+        (lambda: [fly([0.3, 0.3])], r"trial 0 is -1.97\d+ with this one and was -0.98"),
+        (lambda: [fly([2.9, 0.5], start=(3.0, 0.0))], "the sum of rewards of trial 0"),
+        (lambda: [changing()], "the least step reward of trial 0"),
+    ],
+    ids=["whole", "crashed", "theta changes"],
+)
+def test_another_reward_is_noticed(trials, what, tmp_path):
+    path = tmp_path / "search.npz"
+    search_of().tell(trials()).save(path)
+    other = search_of(reward=weighted)
+    with pytest.raises(ValueError, match=what) as caught:
+        other.resume(path)
+    assert str(path) in caught.value.__notes__[0]
+    assert not hasattr(other, "returns_")
+    with pytest.raises(ValueError, match="reward is another one"):
+        other.run(Plant(), 5, path=path)
+    # as it was logged: the same reward by another way, in single precision
+    logged = search_of(reward=lambda states: cost(states).astype(np.float32))
+    logged.resume(path)
+    if not np.isnan(logged.returns_).any():
+        search_of(reward=None).resume(path)
+
+
+def test_returns_given_by_hand_need_no_reward_again(tmp_path):
+    path = tmp_path / "search.npz"
+    search_of().tell(fly([0.3, 0.3]), reward=-7.0).save(path)
+    assert search_of(reward=weighted).resume(path).returns_.tolist() == [-7.0]
+    search_of().tell([fly([0.3, 0.3]), fly([0.4, 0.3])], reward=[-7.0, -6.0]).tell(
+        fly([0.5, 0.3])
+    ).save(path)
+    with pytest.raises(ValueError, match="trial 2"):
+        search_of(reward=weighted).resume(path)
+
+
 def test_a_failing_resume_keeps_what_there_was(tmp_path):
     search = told(search_of(), 2)
     search_of(horizon=7, random_state=1).save(tmp_path / "other.npz")
@@ -107,7 +149,7 @@ def test_files_that_are_none_of_ours(tmp_path):
             search_of().resume(path)
     trials = told(search_of(), 1).trials_
     trials.save(path)
-    with pytest.raises(UnknownFileError, match="not a search"):
+    with pytest.raises(UnknownFileError, match=r"npz: this is not a search"):
         search_of().resume(path)
     np.savez(path, header=np.array([object()]))
     with pytest.raises(UnknownFileError, match="damaged"):
@@ -200,43 +242,31 @@ def test_run_does_not_write_over_another_search(tmp_path):
     assert path.read_bytes() == before
 
 
-CHILD = """
-    import sys, time
-    from pathlib import Path
-    from tests.control.plants import BOUNDS, HORIZON, cost, fly
-    from trajlearn.control.random_search import RandomSearch
+def killed_after_ask(start, path):
+    """Two trials of a search, in a process that is killed after it asked for a third and saved."""
+    context = multiprocessing.get_context("fork")  # an import of the package takes seconds
+    here, there = context.Pipe()
 
-    path = Path(sys.argv[1])
-    search = RandomSearch(bounds=BOUNDS, reward=cost, horizon=HORIZON, random_state=0)
-    for _ in range(2):
-        search.tell(fly(search.ask()))
-    search.ask()
-    search.save(path)
-    print("asked", flush=True)
-    time.sleep(60)
-"""
+    def script():
+        search = start()
+        told(search, 2).ask()
+        search.save(path)
+        there.send("asked")
+        time.sleep(60)
 
-
-def killed_after_ask(code, *args):
-    """Run a script in a child process until it says "asked", then kill it."""
-    child = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(code), *map(str, args)],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    child = context.Process(target=script)
+    child.start()
     try:
-        assert child.stdout is not None
-        assert child.stdout.readline().strip() == "asked"
+        assert here.poll(30)
+        assert here.recv() == "asked"
     finally:
-        os.kill(child.pid, signal.SIGKILL)
-        child.wait()
-        child.stdout.close()
-    assert child.returncode == -signal.SIGKILL
+        child.kill()
+        child.join()
+    assert child.exitcode == -signal.SIGKILL
 
 
 def test_a_process_killed_between_ask_and_tell_loses_nothing(tmp_path):
-    killed_after_ask(CHILD, tmp_path / "search.npz")
+    killed_after_ask(search_of, tmp_path / "search.npz")
     resumed = search_of(random_state=None).resume(tmp_path / "search.npz")
     never_stopped = told(search_of(), 2)
     for _ in range(3):

@@ -25,6 +25,7 @@ def _close_figures():
 class Assessed:
     reward: np.ndarray
     std: np.ndarray | None
+    expected: np.ndarray | None = None
 
 
 @dataclass
@@ -35,6 +36,8 @@ class Believer:
     bounds: np.ndarray
     best_params_: np.ndarray
     sure: bool = False
+    # how much less is expected than of the mean trajectory
+    less: float | None = None
     asked: list = field(default_factory=list)
 
     def history(self):
@@ -44,7 +47,8 @@ class Believer:
         self.asked.append(params)
         off = params - self.best_params_
         std = None if self.sure else 0.1 + np.abs(off).sum(axis=1)
-        return Assessed(-(off**2).sum(axis=1), std)
+        reward = -(off**2).sum(axis=1)
+        return Assessed(reward, std, None if self.less is None else reward - self.less)
 
 
 def believer(n_params, n_trials=6, *, sure=False, n_logged=0, ended=()):
@@ -58,6 +62,7 @@ def believer(n_params, n_trials=6, *, sure=False, n_logged=0, ended=()):
     trials["return"] = returns
     trials["best"] = np.maximum.accumulate(returns)
     trials["predicted"] = np.where(proposed, returns + 0.5, NAN)
+    trials["expected"] = NAN
     trials["predicted_std"] = NAN if sure else np.where(proposed, 0.7, NAN)
     trials["terminated"] = np.isin(np.arange(n_trials), ended)
     trials["source"] = ["logged"] * n_logged + ["model"] * (n_trials - n_logged)
@@ -114,6 +119,19 @@ def test_error_bars_are_predictions_beside_their_trials():
     assert (np.abs(centres.get_xdata() - np.arange(5)) < 0.5).all()
     lengths = [np.ptp(s[:, 1]) for s in spans.get_segments() if len(s) and np.isfinite(s).all()]
     assert_allclose(lengths, 2 * 0.7)
+
+
+def test_error_bars_are_about_the_expected_return():
+    search = believer(1, 5)
+    search.trials["expected"] = search.trials["predicted"] - [0.0, 0.0, 0.0, 0.3, 0.3]
+    ax = plot_search(search)
+    (bar,) = ax.containers
+    assert_allclose(bar[0].get_ydata(), search.trials["expected"])
+    dashes = points(ax)["predicted, of the mean trajectory"]
+    assert_allclose(dashes[:, 1], search.trials["predicted"][3:])
+    assert_array_equal(dashes[:, 0], bar[0].get_xdata()[3:])
+    search.trials["expected"] = search.trials["predicted"]
+    assert "predicted, of the mean trajectory" not in points(plot_search(search))
 
 
 def test_predictions_without_a_standard_deviation_have_no_bars():
@@ -190,6 +208,36 @@ def test_the_band_is_one_standard_deviation():
     for at, mean in zip(x, y):
         here = corners[np.isclose(corners[:, 0], at), 1]
         assert_allclose([here.min(), here.max()], mean + np.array([-1, 1]) * (0.1 + abs(at - 1.3)))
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_the_band_is_about_the_expected_return(given):
+    search = believer(2)
+    search.less = 0.4
+    axes = plt.subplots(1, 2)[1] if given else None
+    panels = plot_slices(search, n_points=11, axes=axes)
+    for ax in panels:
+        (band,) = ax.collections
+        expected, mean_path = ax.get_lines()[:2]
+        assert_allclose(expected.get_ydata(), mean_path.get_ydata() - 0.4)
+        corners = band.get_paths()[0].vertices
+        for at, value in expected.get_xydata():
+            here = corners[np.isclose(corners[:, 0], at), 1]
+            assert_allclose((here.min() + here.max()) / 2, value)
+    figure = panels[0].figure
+    (legend,) = [panels[0].get_legend()] if given else figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "expected",
+        "of the mean trajectory",
+    ]
+
+
+def test_no_legend_where_both_are_the_same():
+    search = believer(1)
+    search.less = 0.0
+    (ax,) = plot_slices(search, n_points=5)
+    assert not ax.figure.legends
+    assert "of the mean trajectory" not in points(ax)
 
 
 def test_no_band_where_the_model_gives_no_standard_deviation():

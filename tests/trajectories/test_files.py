@@ -107,7 +107,8 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(ds, tmp_path, suffi
         handle.write(b"half")
         raise OSError("no space left on device")
 
-    monkeypatch.setattr(files, f"_write_{suffix[1:]}", half)
+    writer = {".npz": "write_npz", ".parquet": "_write_parquet"}[suffix]
+    monkeypatch.setattr(files, writer, half)
     with pytest.raises(OSError, match="no space left"):
         ds[[0]].save(path)
     assert load_dataset(path) == ds

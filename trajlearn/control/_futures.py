@@ -21,6 +21,7 @@ __all__ = [
     "ask_reward",
     "draws_from_generators",
     "later",
+    "policy_of",
     "predicts_rewards",
     "reference_function",
 ]
@@ -70,6 +71,11 @@ class Situation:
 def predicts_rewards(model: Any) -> bool:
     """Whether it is a direct reward model, which predicts no states."""
     return isinstance(unwrapped(model), (DirectRewardGP, DirectRewardNN))
+
+
+def policy_of(model: Any, policy: Any) -> Any:
+    """The policy that is given, or else that of the model; None if there is none."""
+    return getattr(unwrapped(model), "policy", None) if policy is None else policy
 
 
 def draws_from_generators(model: Any) -> bool:
@@ -224,11 +230,13 @@ def later(policy: Any, references: References | None, start_time: float) -> tupl
 def _grid(model: Any, situation: Situation) -> tuple[Floats, NDArray[np.intp]]:
     """Times that the model is to pass through, and which of them are the horizons."""
     inner = unwrapped(model)
-    if not hasattr(inner, "_time_grid"):
+    if not hasattr(inner, "planning_grid"):
         steps = np.searchsorted(situation.all_horizons, situation.horizons)
         return situation.all_horizons, steps
-    grid, chosen = inner._time_grid(situation.horizons)
-    return inner._looked_at(grid, chosen) if situation.references is not None else (grid, chosen)
+    grid, chosen = inner.planning_grid(
+        situation.horizons, references=situation.references is not None
+    )
+    return grid, chosen
 
 
 def _planned(

@@ -10,7 +10,15 @@ from sklearn.utils.validation import check_is_fitted
 from trajlearn.control._futures import predicts_rewards
 from trajlearn.dynamics._members import unwrapped
 
-__all__ = ["check_answerable", "checked_starts", "one_of", "time_step", "whole"]
+__all__ = [
+    "check_answerable",
+    "check_width",
+    "checked_candidates",
+    "checked_starts",
+    "one_of",
+    "time_step",
+    "whole",
+]
 
 Floats = NDArray[np.float64]
 
@@ -61,6 +69,40 @@ def checked_starts(initial_states: ArrayLike) -> Floats:
     if not np.isfinite(states).all():
         raise ValueError("initial_states has NaN or infinite values.")
     return states
+
+
+def checked_candidates(candidates: ArrayLike, horizon: int | None) -> Floats:
+    """Candidates (m, p), or (m, horizon, d_a) where there is a horizon: sequences of actions."""
+    given = np.asarray(candidates, dtype=np.float64)
+    right = given.ndim == 2 if horizon is None else given.ndim == 3 and given.shape[1] == horizon
+    if not right or not len(given):
+        expected = "(m, p)" if horizon is None else f"(m, {horizon}, d_a)"
+        raise ValueError(f"candidates have shape {given.shape}; expected {expected}.")
+    if not np.isfinite(given).all():
+        raise ValueError("candidates have NaN or infinite values.")
+    return given
+
+
+def check_width(model: Any, decision: str, bounds: Floats) -> None:
+    """Whether bounds have a row for each action, or parameter, that a model was fitted with.
+
+    Raises
+    ------
+    ValueError
+    """
+    inner = unwrapped(model)
+    blocks = getattr(getattr(inner, "layout_", None), "columns", {})
+    names = blocks.get("action" if decision == "actions" else "params")
+    # in a pipeline, parameters may be transformed before the model sees them
+    if names is None or (decision == "params" and inner is not model):
+        return
+    if len(names) != len(bounds):
+        what, size = ("actions", "d_a") if decision == "actions" else ("params", "p")
+        raise ValueError(
+            f"bounds has {len(bounds)} rows, but {type(inner).__name__} was fitted with "
+            f"{size} = {len(names)} {what} ({', '.join(names)}): give one row (lower, upper) for "
+            "each."
+        )
 
 
 def check_answerable(

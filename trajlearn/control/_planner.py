@@ -13,6 +13,8 @@ from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import Interval, StrOptions
 from trajlearn.control._decisions import Plan, Session
+from trajlearn.control._futures import policy_of
+from trajlearn.control._objective_checks import check_width, whole
 from trajlearn.control._optimizers import METHODS, checked_bounds, maximise
 from trajlearn.control._safe_set import Guarded
 from trajlearn.control.objective import RISKS, PredictedReturn
@@ -22,7 +24,7 @@ from trajlearn.exceptions import CalibrationWarning, HorizonWarning
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Planner", "one_state", "whole_number"]
+__all__ = ["Planner", "one_state"]
 
 Floats = NDArray[np.float64]
 
@@ -121,11 +123,13 @@ class Planner(BaseEstimator):
         begin = clock.perf_counter()
         self._check()
         session = self._started()
-        n_steps = whole_number(self.horizon if horizon is None else horizon, "horizon")
+        n_steps = whole(self.horizon if horizon is None else horizon, "horizon")
         box = checked_bounds(self.bounds)
         shape = (len(box),) if self.decision == "params" else (n_steps, len(box))
         box = np.tile(box, (n_steps, 1)) if self.decision == "actions" else box
         rng = np.random.default_rng([self.seed_, len(session.rows)])
+        # built anew in a hundredth of the time of a decision, whose horizon, clock, references
+        # and samples are its own
         assess = PredictedReturn(
             self.model,
             reward=self.reward,
@@ -140,7 +144,7 @@ class Planner(BaseEstimator):
             constraint=self.constraint,
             every=min(self.every, n_steps),
             decision=self.decision,
-            policy=self._known_policy(),
+            policy=self.policy,
             references=references,
             context=context,
             phase=phase,
@@ -230,16 +234,14 @@ class Planner(BaseEstimator):
 
     def _known_policy(self) -> Any:
         """The policy that is given, or that of the model."""
-        return (
-            getattr(unwrapped(self.model), "policy", None) if self.policy is None else self.policy
-        )
+        return policy_of(self.model, self.policy)
 
     def _check(self) -> None:
         """Check the parameters, and whether the model can be planned with."""
         self._validate_params()
-        checked_bounds(self.bounds)
         if hasattr(self.model, "fit"):
             check_is_fitted(self.model)
+        check_width(self.model, self.decision, checked_bounds(self.bounds))
         blocks = getattr(unwrapped(self.model), "layout_", None)
         name = type(unwrapped(self.model)).__name__
         if self.decision == "actions":
@@ -253,19 +255,6 @@ class Planner(BaseEstimator):
                 f"decision='params' with a {name} that takes actions needs policy=, which turns "
                 "states and params into actions; or plan over actions."
             )
-
-
-def whole_number(value: object, name: str) -> int:
-    """A number of steps.
-
-    Raises
-    ------
-    ValueError
-        If it is not an integer of at least 1.
-    """
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
-        raise ValueError(f"{name} must be an integer of at least 1; got {value!r}.")
-    return int(value)
 
 
 def one_state(state: ArrayLike) -> Floats:

@@ -1,7 +1,6 @@
 """One file for a search: ``.npz`` without pickle, written whole or not at all."""
 
 import io
-import json
 from dataclasses import asdict
 from pathlib import Path
 from typing import IO, Any
@@ -10,25 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trajlearn.control._trials import Proposal, Trials
-from trajlearn.exceptions import UnknownFileError
-from trajlearn.trajectories.files import _read_npz, _replace, _write_npz
+from trajlearn.trajectories._archive import FileKind, read_file, write_file
+from trajlearn.trajectories.files import read_npz, write_npz
 
-__all__ = ["read_search", "write_search"]
+__all__ = ["read_search", "taken_up", "write_search"]
 
-_FORMAT, _VERSION = "trajlearn.search", 1
+_KIND = FileKind("trajlearn.search", 1, "search")
 _RECORD = "record."
 
 
 def write_search(path: str | Path, name: str, state: Trials) -> None:
     """Write the state of a search of the class `name`; a file of that path is replaced."""
-    header: dict[str, Any] = {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "class": name,
-        "seed": state.seed,
-        "horizon": state.horizon,
-        "n_asked": state.n_asked,
-    }
+    header = _KIND.header(
+        seed=state.seed, horizon=state.horizon, n_asked=state.n_asked, **{"class": name}
+    )
     arrays: dict[str, NDArray[Any]] = {"bounds": state.bounds}
     if state.pending is not None:
         # Python's JSON keeps every bit of a float
@@ -37,15 +31,10 @@ def write_search(path: str | Path, name: str, state: Trials) -> None:
         arrays["last"] = state.last
     if state.data is not None:
         buffer = io.BytesIO()
-        _write_npz(state.data, buffer)
+        write_npz(state.data, buffer)
         arrays["trials"] = np.frombuffer(buffer.getvalue(), dtype=np.uint8)
         arrays |= {f"{_RECORD}{key}": values for key, values in state.records.items()}
-    arrays["header"] = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-
-    def write(handle: IO[bytes]) -> None:
-        np.savez(handle, allow_pickle=False, **arrays)
-
-    _replace(Path(path), write)
+    write_file(Path(path), lambda handle: _KIND.write_npz(handle, header, arrays))
 
 
 def read_search(path: str | Path) -> tuple[str, Trials]:
@@ -58,37 +47,11 @@ def read_search(path: str | Path) -> tuple[str, Trials]:
     UnknownFileError
         If it is truncated, changed, or of another kind.
     """
-    with Path(path).open("rb") as handle:
-        try:
-            return _read(handle)
-        except _Foreign as error:
-            raise UnknownFileError(f"{path}: {error}") from error
-        # as for datasets: a damaged file fails in any of a dozen ways
-        except Exception as error:
-            raise UnknownFileError(
-                f"{path} is damaged: truncated, or changed after it was saved "
-                f"({type(error).__name__}: {error})."
-            ) from error
-
-
-class _Foreign(Exception):
-    """A sound file that is not of a search."""
+    return read_file(Path(path), _read)
 
 
 def _read(handle: IO[bytes]) -> tuple[str, Trials]:
-    archive = np.load(handle, allow_pickle=False)
-    if not isinstance(archive, np.lib.npyio.NpzFile) or "header" not in archive.files:
-        raise _Foreign("this is not a search that trajlearn saved.")
-    with archive:
-        arrays = {key: archive[key] for key in archive.files}
-    header = json.loads(arrays["header"].tobytes())
-    if not isinstance(header, dict) or header.get("format") != _FORMAT:
-        raise _Foreign("this is not a search that trajlearn saved.")
-    if header.get("version") != _VERSION:
-        raise _Foreign(
-            f"the file has version {header.get('version')!r} of the format, this package reads "
-            f"{_VERSION}. Use the version of trajlearn that wrote it, or a newer one."
-        )
+    header, arrays = _KIND.read_npz(handle)
     pending = header.get("pending")
     if pending is not None:
         pending = Proposal(**pending | {"params": np.array(pending["params"], dtype=np.float64)})
@@ -100,7 +63,7 @@ def _read(handle: IO[bytes]) -> tuple[str, Trials]:
         n_asked=int(header["n_asked"]),
         pending=pending,
         last=arrays.get("last"),
-        data=None if trials is None else _read_npz(io.BytesIO(trials.tobytes())),
+        data=None if trials is None else read_npz(io.BytesIO(trials.tobytes())),
         records={
             key.removeprefix(_RECORD): values
             for key, values in arrays.items()
@@ -110,3 +73,30 @@ def _read(handle: IO[bytes]) -> tuple[str, Trials]:
     if any(len(values) != len(state) for values in state.records.values()):
         raise ValueError("the records do not match the trials")
     return header["class"], state
+
+
+def taken_up(mine: Trials, found: Trials, path: str | Path) -> tuple[Trials, int]:
+    """What to go on from, the state of a search or of its file, and how many proposals were made.
+
+    Raises
+    ------
+    ValueError
+        If the trials of one are not the first of the other.
+    """
+    n = min(len(mine), len(found))
+    if n:
+        assert mine.data is not None
+        assert found.data is not None
+        old, new = mine.data[:n], found.data[:n]
+        if not (
+            np.array_equal(old.offsets, new.offsets) and np.array_equal(old.states, new.states)
+        ):
+            raise ValueError(
+                f"{path} holds a search with other trials than this one: give another path, or "
+                "resume(path) in a new search."
+            )
+    if len(found) < len(mine) or found.n_asked < mine.n_asked:
+        return mine, 0
+    # a proposal that waits for its trial is still to be run
+    ahead = [state.n_asked - (state.pending is not None) for state in (found, mine)]
+    return found, max(ahead[0] - ahead[1], 0)

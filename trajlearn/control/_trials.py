@@ -1,19 +1,17 @@
 """What a search has asked for and was told: replaced whole, so that an error changes nothing."""
 
-import warnings
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from trajlearn.exceptions import MissingFieldError, MixedSamplingError
 from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories.edits import concatenate
-from trajlearn.trajectories.rewards import Reward, _logged
 from trajlearn.trajectories.times import uniform_step
 
-__all__ = ["Proposal", "Trials", "joined", "measured", "warn_of_ends"]
+__all__ = ["Proposal", "Trials", "joined"]
 
 Floats = NDArray[np.float64]
 # fields of a dataset that models do without: dropped where only some trials have them
@@ -33,6 +31,8 @@ class Proposal:
         Predicted probability that some state of the trial violates the constraint.
     source : str
         What proposed it: ``"sobol"``, ``"model"``, ...
+    expected : float or None
+        Predicted mean return, which `std` is about; `reward` may be that of a mean trajectory.
     """
 
     params: Floats
@@ -40,6 +40,7 @@ class Proposal:
     std: float | None = None
     violation: float | None = None
     source: str = "model"
+    expected: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,8 +49,9 @@ class Trials:
 
     `records` holds one value a trial: ``params`` (n, p), NaN where theta changes during the
     trial; ``total``, the sum of the rewards that were measured (or the return as given),
-    ``missing``, the steps that a crash left out, ``least``, the least step reward; ``predicted``,
-    ``std``, ``violation`` and ``source`` of the proposal.
+    ``missing``, the steps that a crash left out, ``least``, the least step reward, NaN if the
+    return was given; ``predicted``, ``expected``, ``std``, ``violation`` and ``source`` of the
+    proposal.
     """
 
     seed: int
@@ -63,6 +65,17 @@ class Trials:
 
     def __len__(self) -> int:
         return 0 if self.data is None else len(self.data)
+
+    def differing(self, bounds: Floats, horizon: int) -> list[str]:
+        """How bounds and a horizon differ from those of the search, in words."""
+        found = []
+        if bounds.shape != self.bounds.shape:
+            found.append(f"p = {len(bounds)} here, {len(self.bounds)} there")
+        elif not np.array_equal(bounds, self.bounds):
+            found.append(f"bounds = {bounds.tolist()} here, {self.bounds.tolist()} there")
+        if horizon != self.horizon:
+            found.append(f"horizon = {horizon} here, {self.horizon} there")
+        return found
 
     def returns(self, terminal_reward: float | None) -> Floats:
         """Return of each trial (n,), NaN where theta changed on the way."""
@@ -113,9 +126,8 @@ def joined(state: Trials, ds: TrajectoryDataset) -> tuple[TrajectoryDataset, Tra
             f"the trial has {len(ds.param_names)} params, bounds= says {p} ({p} rows)."
         )
     dt = _step_of(ds)
-    ids = np.arange(len(state), len(state) + len(ds))
+    ds = ds.assign(ids=list(range(len(state), len(state) + len(ds))))
     if old is None:
-        ds = TrajectoryDataset._of(replace(ds._columns, ids=ids).freeze(), ds._names)
         return ds, ds
     if len(ds.state_names) != len(old.state_names):
         raise ValueError(
@@ -133,25 +145,12 @@ def joined(state: Trials, ds: TrajectoryDataset) -> tuple[TrajectoryDataset, Tra
             ds = ds.assign(**{name: None})
         elif getattr(ds, name) is None:
             old = old.assign(**{name: None})
-    ds = TrajectoryDataset._of(replace(ds._columns, ids=ids).freeze(), _names(old, ds))
+    ds = TrajectoryDataset._of(ds._columns, _names(old, ds))
     try:
         return ds, concatenate(old, ds)
     except ValueError as error:
         error.add_note("The first are the trials told before, number 2 is what is told now.")
         raise
-
-
-def warn_of_ends(ds: TrajectoryDataset, is_terminal: Any, horizon: int) -> None:
-    """Warn where trials ended early, but nothing says where predicted ones do."""
-    early = ds.terminated & (ds.lengths < horizon)
-    if is_terminal is None and early.any():
-        warnings.warn(
-            f"{early.sum()} trial(s) ended early, but is_terminal=None: predicted trials go on to "
-            "the horizon whatever happens. Give is_terminal= and terminal_reward=, so that a "
-            "predicted end costs what a real one does.",
-            UserWarning,
-            stacklevel=4,
-        )
 
 
 def _step_of(ds: TrajectoryDataset) -> float:
@@ -178,96 +177,3 @@ def _names(old: TrajectoryDataset, ds: TrajectoryDataset) -> dict[str, tuple[str
 def _is_numbered(names: tuple[str, ...]) -> bool:
     prefixes = ("s", "a", "theta", "ref")
     return any(names == tuple(f"{prefix}{i}" for i in range(len(names))) for prefix in prefixes)
-
-
-def measured(
-    state: Trials, ds: TrajectoryDataset, reward: Reward | None, given: ArrayLike | None
-) -> dict[str, NDArray[Any]]:
-    """Records of new trials.
-
-    Raises
-    ------
-    ValueError
-        If a return is unknown or not finite; the message names the trial.
-    """
-    n = len(ds)
-    params = np.stack([_one_theta(ds, i, state.horizon) for i in range(n)])
-    by_hand = _given_returns(given, params)
-    if by_hand is None and reward is None:
-        ds.require("rewards", by="reward=None (the logged reward)")
-    total, least, missing = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, dtype=np.intp)
-    for i, episode in enumerate(ds):
-        if by_hand is not None:
-            total[i] = by_hand[i]
-            continue
-        rewards = _logged(episode, reward)[: state.horizon]
-        if not np.isfinite(rewards).all():
-            raise ValueError(
-                f"trial {episode.id}: a step has the reward {rewards[~np.isfinite(rewards)][0]}, "
-                "so the trial has no return: mend the reward function, or give reward=."
-            )
-        least[i] = rewards.min()
-        if np.isnan(params[i]).any():
-            continue
-        total[i], missing[i] = rewards.sum(), state.horizon - len(rewards)
-        if missing[i] and not episode.terminated:
-            raise ValueError(
-                f"trial {episode.id} has {episode.length} steps, fewer than the horizon of "
-                f"{state.horizon}, and did not terminate by itself, so its return is unknown: log "
-                "it longer, set terminated=True if it crashed, or give its return as reward=."
-            )
-    return {
-        "params": params,
-        "total": total,
-        "least": least,
-        "missing": missing,
-        **_predicted(state, params),
-    }
-
-
-def _one_theta(ds: TrajectoryDataset, i: int, horizon: int) -> Floats:
-    """Theta of a trial (p,), NaN if it changes before the horizon."""
-    theta = ds[i].params
-    if theta.ndim == 1:
-        return theta
-    steps = theta[:horizon]
-    return steps[0] if (steps == steps[0]).all() else np.full(theta.shape[1], np.nan)
-
-
-def _given_returns(given: ArrayLike | None, params: Floats) -> Floats | None:
-    if given is None:
-        return None
-    values = np.asarray(given, dtype=np.float64)
-    if values.ndim == 0 and len(params) == 1:
-        values = values[None]
-    if values.shape != (len(params),):
-        raise ValueError(
-            f"reward has shape {values.shape}: give one return for each of the {len(params)} "
-            "trial(s)."
-        )
-    if not np.isfinite(values).all():
-        raise ValueError(f"reward = {values[~np.isfinite(values)][0]} must be finite.")
-    if np.isnan(params).any():
-        raise ValueError(
-            "theta changes during a trial, so there is no theta that its return belongs to: leave "
-            "reward= out, the trial then only serves the model."
-        )
-    return values
-
-
-def _predicted(state: Trials, params: Floats) -> dict[str, NDArray[Any]]:
-    """What was predicted of the trials that follow the proposal; others were logged elsewhere."""
-    n, proposal = len(params), state.pending
-    predicted: dict[str, NDArray[Any]] = {
-        name: np.full(n, np.nan) for name in ("predicted", "std", "violation")
-    }
-    source = np.full(n, "logged", dtype="U32")
-    if proposal is not None:
-        # files and robots round
-        span = state.bounds[:, 1] - state.bounds[:, 0]
-        follows = (np.abs(params - proposal.params) <= 1e-6 * span).all(axis=1)
-        values = (proposal.reward, proposal.std, proposal.violation)
-        for name, value in zip(predicted, values, strict=True):
-            predicted[name][follows] = np.nan if value is None else value
-        source[follows] = proposal.source
-    return predicted | {"source": source}

@@ -1,12 +1,12 @@
 """Bayesian optimisation: a model of the return instead of one of the dynamics."""
 
+from numbers import Integral
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trajlearn._sklearn import StrOptions
-from trajlearn.control._optimizers import checked_bounds
+from trajlearn._sklearn import Interval, StrOptions
 from trajlearn.control._return_gp import (
     ACQUISITIONS,
     ReturnGP,
@@ -30,7 +30,7 @@ class BayesianSearch(Search):
     A Gaussian process is fitted to (theta, return) of the trials, theta scaled to the unit cube
     and returns standardised, and asked where a trial promises the most. It needs no states, and
     learns one number from a trial; `PolicySearch` learns from every step. Needs BoTorch (the
-    extra ``search``).
+    extra ``search``); the first `ask` says so if it is missing, before any trial is run.
 
     Parameters
     ----------
@@ -79,6 +79,10 @@ class BayesianSearch(Search):
     the same proposals to the bit, on one thread; torch's generators and threads are left as they
     were.
 
+    A proposal is where the acquisition is greatest, and that follows from the trials: told the
+    same ones, searches of other seeds propose the same, unless their optimisers end in other
+    maxima. The seed decides the Sobol points, and where the optimiser begins.
+
     References
     ----------
     .. [1] S. Ament et al., "Unexpected Improvements to Expected Improvement for Bayesian
@@ -102,6 +106,7 @@ class BayesianSearch(Search):
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **Search._parameter_constraints,
+        "n_initial": [Interval(Integral, 1, None, closed="left")],
         "acquisition": [StrOptions(set(ACQUISITIONS))],
         "noisy": ["boolean"],
     }
@@ -119,34 +124,17 @@ class BayesianSearch(Search):
         random_state: Any = None,
         verbose: int = 0,
     ) -> None:
-        self.bounds = bounds
-        self.reward = reward
-        self.horizon = horizon
+        super().__init__(
+            bounds=bounds,
+            reward=reward,
+            horizon=horizon,
+            terminal_reward=terminal_reward,
+            random_state=random_state,
+            verbose=verbose,
+        )
         self.n_initial = n_initial
-        self.terminal_reward = terminal_reward
         self.acquisition = acquisition
         self.noisy = noisy
-        self.random_state = random_state
-        self.verbose = verbose
-
-    def ask(self) -> Floats:
-        """Parameters to run next.
-
-        Asking again without a `tell` in between gives the same ones.
-
-        Returns
-        -------
-        ndarray of shape (p,)
-
-        Raises
-        ------
-        ImportError
-            If BoTorch is missing; at the first call already, before any trial was run.
-        ValueError
-            If the search was built with something impossible.
-        """
-        import_extra("botorch", "search", by=type(self).__name__)
-        return super().ask()
 
     def predict_return(self, params: ArrayLike) -> Assessment:
         """Return of a trial as the process predicts it.
@@ -168,32 +156,33 @@ class BayesianSearch(Search):
             If no trial with a return was told yet.
         """
         import_extra("botorch", "search", by=type(self).__name__)
-        self._begun()
-        self._best()
-        theta = np.atleast_2d(np.asarray(params, dtype=np.float64))
-        p = len(checked_bounds(self.bounds))
-        if theta.ndim != 2 or theta.shape[1] != p or not np.isfinite(theta).all():
-            raise ValueError(
-                f"params of shape {theta.shape} must be finite and of shape (m, {p}), as bounds= "
-                "says."
-            )
+        candidates = self._candidates(params)
+        self._best()  # raises without any
         with same_bits(self.seed_):
-            mean, std = self._fitted().moments(self._in_cube(theta), noise=True)
-        return Assessment(mean, mean, std, None)
+            mean, std = self._fitted().moments(self._in_cube(candidates), noise=True)
+        return Assessment(mean, mean, std, None, expected=mean)
+
+    def _ready(self) -> bool:
+        # said before any trial is run
+        import_extra("botorch", "search", by=type(self).__name__)
+        return super()._ready()
 
     def _propose(self, rng: np.random.Generator) -> Proposal:
         seed = int(rng.integers(2**31))
-        low, high = checked_bounds(self.bounds).T
+        low, high = self._told().bounds.T
         with same_bits(seed):
             gp = self._fitted()
             point = propose(gp, self.acquisition, seed)
             mean, std = gp.moments(point[None], noise=True)
-        return Proposal(low + (high - low) * point, float(mean[0]), float(std[0]))
+        expected = float(mean[0])
+        return Proposal(
+            low + (high - low) * point, reward=expected, std=float(std[0]), expected=expected
+        )
 
     def _fitted(self) -> ReturnGP:
         params, returns = self._tried()
         return fit_return_gp(self._in_cube(params), returns, noisy=self.noisy)
 
     def _in_cube(self, params: Floats) -> Floats:
-        low, high = checked_bounds(self.bounds).T
+        low, high = self._told().bounds.T
         return (params - low) / (high - low)

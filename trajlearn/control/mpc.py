@@ -9,7 +9,8 @@ from sklearn.utils import check_random_state
 from tqdm import tqdm
 
 from trajlearn.control._decisions import Plan
-from trajlearn.control._planner import Planner, one_state, whole_number
+from trajlearn.control._objective_checks import whole
+from trajlearn.control._planner import Planner, one_state
 from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories.edits import assign, concatenate
 
@@ -194,16 +195,7 @@ class MPC(Planner):
             self._session.next_trial()
         return self
 
-    def act(
-        self,
-        state: ArrayLike,
-        time: float = 0.0,
-        *,
-        horizon: int | None = None,
-        references: Any = None,
-        context: Any = None,
-        phase: Any = None,
-    ) -> Floats:
+    def act(self, state: ArrayLike, time: float = 0.0, **settings: Any) -> Floats:
         """The action at the next step of the trial; plans first where `hold` steps have passed.
 
         Parameters
@@ -211,8 +203,8 @@ class MPC(Planner):
         state : array-like of shape (d_s,)
         time : float, default=0.0
             Time since the trial began, see `plan`.
-        horizon, references, context, phase
-            As in `plan`.
+        **settings
+            Further arguments of `plan`: `horizon`, `references`, `context`, `phase`.
 
         Returns
         -------
@@ -226,14 +218,7 @@ class MPC(Planner):
         session = self._started()
         plan = session.plan
         if plan is None or session.held >= self._kept(plan):
-            plan = self.plan(
-                state,
-                time=time,
-                horizon=horizon,
-                references=references,
-                context=context,
-                phase=phase,
-            )
+            plan = self.plan(state, time=time, **settings)
         if plan.params is not None:
             action = self._controlled(one_state(state), plan.params, time)
         else:
@@ -278,7 +263,7 @@ class MPC(Planner):
             raise ValueError(
                 f"dt = {self.dt:g}, but a step of the environment takes {env.dt:g}: leave dt= out."
             )
-        length = whole_number(length, "length")
+        length = whole(length, "length")
         starts = np.asarray(initial_states, dtype=np.float64)
         starts = starts[None] if starts.ndim == 1 else starts
         self._start_session(dt=env.dt, policy=env.policy)

@@ -9,27 +9,24 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trajlearn.control._common_numbers import CommonNumbers
+from trajlearn.control._forecast_returns import Moments, RewardModel, Trajectories
 from trajlearn.control._futures import (
     Situation,
-    ask_forecast,
-    ask_reward,
-    draws_from_generators,
     later,
+    policy_of,
     predicts_rewards,
     reference_function,
 )
 from trajlearn.control._objective_checks import (
     check_answerable,
+    checked_candidates,
     checked_starts,
     one_of,
     time_step,
     whole,
 )
-from trajlearn.control._returns import Quadrature, Returns, States, flags
+from trajlearn.control._returns import Quadrature, Returns, States
 from trajlearn.control._signals import Signals, named_by
-from trajlearn.dynamics._members import unwrapped
-from trajlearn.dynamics.forecast import Forecast
 from trajlearn.exceptions import CalibrationWarning, DivergenceWarning, HorizonWarning
 from trajlearn.trajectories._relabeler import generator
 from trajlearn.trajectories.rewards import Reward, step_rewards
@@ -42,7 +39,6 @@ __all__ = ["RISKS", "Assessment", "PredictedReturn"]
 RISKS = ("mean", "expected", "lcb")
 
 Floats = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 # states predicted at once, of all steps and samples: about 10 MB an array of 4 states
 _CHUNK_STATES = 2**18
@@ -57,17 +53,21 @@ class Assessment:
     value : ndarray of shape (m,)
         What is maximised.
     reward : ndarray of shape (m,)
-        Predicted return, averaged over initial states.
+        Predicted return, averaged over initial states: with ``risk="mean"`` that of the mean
+        trajectories, else the mean return.
     std : ndarray of shape (m,) or None
-        Its standard deviation, where trajectories were sampled.
+        Standard deviation of the return, where trajectories were sampled.
     violation : ndarray of shape (m,) or None
         Share of the sampled trajectories with a state that the constraint forbids.
+    expected : ndarray of shape (m,) or None
+        Mean return, which `std` is about; None where there is no `std`.
     """
 
     value: Floats
     reward: Floats
     std: Floats | None
     violation: Floats | None
+    expected: Floats | None = None
 
 
 class PredictedReturn:
@@ -231,7 +231,7 @@ class PredictedReturn:
             every=self.every,
         )
         self._direct, self.dt = predicts_rewards(model), time_step(dt, model)
-        self.policy = getattr(unwrapped(model), "policy", None) if policy is None else policy
+        self.policy = policy_of(model, policy)
         self.references = None
         if references is not None:
             self.references = reference_function(
@@ -284,9 +284,8 @@ class PredictedReturn:
         ValueError
             If candidates have another shape or are not finite, or a reward is NaN.
         """
-        given = self._checked(candidates)
-        copies = self.n_samples if self._sampled() else 1
-        states = self.horizon * len(self.initial_states) * copies
+        given = checked_candidates(candidates, self.horizon if self.decision == "actions" else None)
+        states = self.horizon * len(self.initial_states) * self._n_drawn
         size = max(_CHUNK_STATES // states, 1)
         with warnings.catch_warnings():
             # a diverged forecast has its value, and a search asks for thousands of them; what
@@ -297,16 +296,19 @@ class PredictedReturn:
                 if self._warned:
                     warnings.simplefilter("ignore", HorizonWarning)
                     warnings.simplefilter("ignore", CalibrationWarning)
-                parts.append(self._assess(given[at : at + size]))
+                parts.append(self._predict(given[at : at + size]))
                 self._warned.add(True)
-        reward, std, violation = (_joined(column) for column in zip(*parts))
-        assert reward is not None
+        reward = np.concatenate([part.reward for part in parts])
+        expected, std, violation = (
+            _joined([getattr(part, name) for part in parts])
+            for name in ("expected", "std", "violation")
+        )
         value = reward
         if self.risk == "lcb":
-            assert std is not None
+            assert std is not None  # a model that gives none has said so
             with np.errstate(invalid="ignore"):
                 value = np.where(np.isfinite(reward), reward - self.kappa * std, -np.inf)
-        return Assessment(value, reward, std, violation)
+        return Assessment(value, reward, std, violation, expected)
 
     def gradient(self) -> "ReturnGradient":
         """The derivative of the predicted return in theta, of a model that has one.
@@ -336,76 +338,6 @@ class PredictedReturn:
                 "(optimizer='cma')."
             )
         return ReturnGradient(self.model, self._situation, self._returns)
-
-    # -- what is assessed -----------------------------------------------------------------
-
-    def _sampled(self) -> bool:
-        return not self._direct and (self.risk != "mean" or self.constraint is not None)
-
-    def _assess(self, candidates: Floats) -> tuple[Floats, Floats | None, Floats | None]:
-        """Reward, std and violation of a chunk of candidates."""
-        if self._direct:
-            return self._assess_directly(candidates)
-        n_starts = len(self.initial_states)
-        shape = (len(candidates), n_starts)
-        n_samples = self.n_samples if self._sampled() else None
-        random_state: Any = self._seed
-        if n_samples and draws_from_generators(self.model):
-            random_state = CommonNumbers(
-                self._seed, n_samples, len(candidates) * n_starts, n_starts
-            )
-        forecast = ask_forecast(
-            self.model,
-            self._situation,
-            candidates,
-            n_samples=n_samples,
-            random_state=random_state,
-        )
-        mean = None
-        if self.risk == "mean":
-            returns, _ = self._judged(forecast.mean, _diverged(forecast), candidates)
-            mean = returns.reshape(shape).mean(axis=1)
-            if not n_samples:
-                return mean, None, None
-        samples = forecast.samples
-        # both were asked for
-        assert n_samples is not None
-        assert samples is not None
-        gone: Flags = np.asarray(~np.isfinite(samples).all(axis=-1))
-        returns, broken = self._judged(samples, gone if gone.any() else None, candidates)
-        # contiguous, so that numpy adds in the same order for one candidate as for many
-        drawn = np.ascontiguousarray(returns.reshape(n_samples, *shape).mean(axis=2).T)
-        with np.errstate(invalid="ignore"):
-            std = drawn.std(axis=1)
-        std[np.isinf(drawn).any(axis=1)] = np.inf
-        share = None if broken is None else broken.reshape(n_samples, *shape).mean(axis=(0, 2))
-        return drawn.mean(axis=1) if mean is None else mean, std, share
-
-    def _assess_directly(self, params: Floats) -> tuple[Floats, Floats | None, None]:
-        mean, std = ask_reward(self.model, self._situation, params, return_std=self.risk == "lcb")
-        shape = (len(params), len(self.initial_states))
-        reward = self.horizon * mean.reshape(shape).mean(axis=1)
-        if std is None:
-            return reward, None, None
-        # errors of one model at several initial states go together
-        return reward, self.horizon * std.reshape(shape).mean(axis=1), None
-
-    def _judged(
-        self, states: Floats, gone: Flags | None, candidates: Floats
-    ) -> tuple[Floats, Flags | None]:
-        """Returns (..., n) of trajectories (..., n, k, d_s), and which break the constraint."""
-        states, count, ended = self._returns.lived(states, gone)
-        returns = self._returns.of(states, count, candidates)
-        if self.constraint is None or states.ndim == 3:
-            return returns, None
-        allowed = flags(self.constraint, states, "constraint")
-        lived = np.arange(states.shape[-2]) < count[..., None]
-        broken: Flags = np.asarray((~allowed & lived).any(axis=-1))
-        if gone is not None:
-            broken |= gone.any(axis=-1) & ~ended
-        return returns, broken
-
-    # -- checks ---------------------------------------------------------------------------
 
     def _begin_at(self, initial_states: ArrayLike, start_time: float) -> None:
         self.initial_states, self.start_time = checked_starts(initial_states), start_time
@@ -439,26 +371,21 @@ class PredictedReturn:
             self.is_terminal,
             self.terminal_reward,
         )
-
-    def _checked(self, candidates: ArrayLike) -> Floats:
-        given = np.asarray(candidates, dtype=np.float64)
-        right = given.ndim == 2 if self.decision == "params" else given.ndim == 3
-        if right and self.decision == "actions":
-            right = given.shape[1] == self.horizon
-        if not right or not len(given):
-            expected = "(m, p)" if self.decision == "params" else f"(m, {self.horizon}, d_a)"
-            raise ValueError(f"candidates have shape {given.shape}; expected {expected}.")
-        if not np.isfinite(given).all():
-            raise ValueError("candidates have NaN or infinite values.")
-        return given
-
-
-def _diverged(forecast: Forecast) -> Flags | None:
-    """Where mean trajectories (n, k) are unknown; None if nowhere."""
-    first = forecast.diverged_at[:, None]
-    if not first.any():
-        return None
-    return (first > 0) & (np.arange(1, forecast.mean.shape[1] + 1) >= first)
+        sampled = not self._direct and (self.risk != "mean" or self.constraint is not None)
+        self._n_drawn = self.n_samples if sampled else 1
+        self._predict: Callable[[Floats], Moments] = (
+            RewardModel(self.model, self._situation, self.horizon, return_std=self.risk == "lcb")
+            if self._direct
+            else Trajectories(
+                self.model,
+                self._situation,
+                self._returns,
+                self.constraint,
+                of_mean=self.risk == "mean",
+                n_samples=self.n_samples if sampled else None,
+                seed=self._seed,
+            )
+        )
 
 
 def _joined(parts: Sequence[Floats | None]) -> Floats | None:

@@ -1,6 +1,7 @@
 """Search with a model of the dynamics: what it predicts to be best is tried next."""
 
 from contextlib import suppress
+from dataclasses import replace
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -9,11 +10,13 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.frozen import FrozenEstimator
 
 from trajlearn._sklearn import HasMethods, Interval, StrOptions
+from trajlearn.control._best_params import COPIES, Goal, best_params
 from trajlearn.control._each_once import each_once
 from trajlearn.control._futures import predicts_rewards
-from trajlearn.control._optimizers import METHODS, maximise
-from trajlearn.control._safe_set import best_to_worst, ranked
-from trajlearn.control._trials import Trials, warn_of_ends
+from trajlearn.control._next_trial import first_states, future_known, signals_of
+from trajlearn.control._optimizers import METHODS
+from trajlearn.control._trial_returns import warn_of_ends
+from trajlearn.control._trials import Trials
 from trajlearn.control.objective import RISKS, Assessment, PredictedReturn
 from trajlearn.control.search import Proposal, Search
 from trajlearn.dynamics._learner import seeded
@@ -21,7 +24,6 @@ from trajlearn.dynamics._members import member_of, n_members
 from trajlearn.exceptions import MissingFieldError, NoUncertaintyError, UnsafeProposalError
 from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories.rewards import Reward, step_rewards
-from trajlearn.trajectories.times import uniform_step
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -31,8 +33,6 @@ __all__ = ["PolicySearch"]
 Floats = NDArray[np.float64]
 # what the random streams of one search are for, beside those of `Search`
 _FIT, _PREDICT = 2, 3
-# candidates that keep the constraint in some samples and are judged by others, this many times more
-_CONFIRMED, _COPIES = 64, 4
 
 
 class PolicySearch(Search):
@@ -97,8 +97,8 @@ class PolicySearch(Search):
     Attributes
     ----------
     model_ : estimator
-        Fitted on all trials told before the last proposal or prediction; after `resume` there is
-        none until then.
+        Fitted on all trials told before the last proposal or prediction; at the first look, on
+        all trials, if there was none, as after `resume`.
     trials_ : TrajectoryDataset
     returns_ : ndarray of shape (n,)
     best_params_ : ndarray of shape (p,)
@@ -145,6 +145,9 @@ class PolicySearch(Search):
     array([1.])
     """
 
+    # a fitted model, and what it was fitted on
+    _last_fit: tuple[Any, tuple[Any, ...]] | None = None
+
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         **Search._parameter_constraints,
         "model": [HasMethods(["fit", "predict"])],
@@ -185,10 +188,15 @@ class PolicySearch(Search):
         random_state: Any = None,
         verbose: int = 0,
     ) -> None:
+        super().__init__(
+            bounds=bounds,
+            reward=reward,
+            horizon=horizon,
+            terminal_reward=terminal_reward,
+            random_state=random_state,
+            verbose=verbose,
+        )
         self.model = model
-        self.bounds = bounds
-        self.reward = reward
-        self.horizon = horizon
         self.optimizer = optimizer
         self.n_initial = n_initial
         self.initial_states = initial_states
@@ -196,17 +204,17 @@ class PolicySearch(Search):
         self.kappa = kappa
         self.n_samples = n_samples
         self.is_terminal = is_terminal
-        self.terminal_reward = terminal_reward
         self.constraint = constraint
         self.max_violation = max_violation
         self.every = every
         self.n_evaluations = n_evaluations
         self.policy = policy
-        self.random_state = random_state
-        self.verbose = verbose
 
     def _validate_params(self) -> None:
         super()._validate_params()
+        if isinstance(self.model, type):
+            name = self.model.__name__
+            raise ValueError(f"model = {name} is a class: give an estimator, model = {name}(...).")
         if self.optimizer == "gradient" and self.objective in ("expected", "lcb"):
             # said before a trial is run
             raise ValueError(
@@ -227,36 +235,29 @@ class PolicySearch(Search):
         Returns
         -------
         Assessment
-            ``reward`` (m,), its ``std`` (None if the model gives none), ``violation`` (None
-            without `constraint`) and ``value``, what `objective` makes of them.
+            ``reward`` (m,), of the mean trajectories with the objectives "mean" and "thompson";
+            ``expected``, the mean return, and ``std`` (None if the model gives none);
+            ``violation`` (None without `constraint`) and ``value``, what `objective` makes of
+            them.
 
         Raises
         ------
         ValueError
             If `params` has another shape, or nothing was told that a model could learn from.
         """
-        state = self._begun()
-        candidates = np.atleast_2d(np.asarray(params, dtype=np.float64))
-        if candidates.ndim != 2 or candidates.shape[1] != len(state.bounds):
-            raise ValueError(
-                f"params has shape {np.shape(params)}; expected (m, {len(state.bounds)})."
-            )
-        if not np.isfinite(candidates).all():
-            raise ValueError("params has NaN or infinite values.")
-        seed = int(self._rng(len(state), _PREDICT).integers(2**31))
+        candidates = self._candidates(params)
+        seed = int(self._rng(len(self._told()), _PREDICT).integers(2**31))
         with each_once():
             return self._assess(self._fitted(), candidates, seed)
 
     def _assess(self, model: Any, candidates: Floats, seed: int) -> Assessment:
         """Assessment of few candidates, with a standard deviation if the model gives any."""
-        copies = 1 if self.constraint is None else _COPIES
+        copies = 1 if self.constraint is None else COPIES
         found = self._objective(model, seed, copies=copies)(candidates)
         if found.std is None:
-            try:
-                std = self._objective(model, seed, risk="lcb", constrained=False)(candidates).std
-            except NoUncertaintyError:
-                std = None
-            found = Assessment(found.value, found.reward, std, found.violation)
+            with suppress(NoUncertaintyError):
+                drawn = self._objective(model, seed, risk="lcb", constrained=False)(candidates)
+                found = replace(found, expected=drawn.expected, std=drawn.std)
         return found
 
     def _objective(
@@ -269,7 +270,6 @@ class PolicySearch(Search):
         copies: int = 1,
     ) -> PredictedReturn:
         state = self._told()
-        data, settings = state.data, dict[str, Any]()
         price = self.terminal_reward
         price = state.least_reward() if price is None else price
         if self.is_terminal is not None and price is None and not predicts_rewards(model):
@@ -277,21 +277,6 @@ class PolicySearch(Search):
                 "terminal_reward=None takes the least step reward of all trials, but no reward was "
                 "measured in any: give terminal_reward=."
             )
-        if data is not None:
-            if not _future_known(state):
-                raise ValueError(
-                    f"no trial ran over the horizon of {state.horizon} steps yet, so the "
-                    "references of the next one are unknown: tell one that did."
-                )
-            whole = np.flatnonzero(data.lengths >= state.horizon)
-            last = data[int(whole[-1]) if len(whole) else -1]
-            settings = {"dt": uniform_step(data), "state_names": data.state_names}
-            settings["start_time"] = float(last.times[0])
-            settings["context"] = dict(last.context)
-            if last.references is not None:
-                settings["references"] = last.references
-            if not np.isnan(last.time_origin):
-                settings["phase"] = last.times[0] - last.time_origin
         if risk is None:
             risk = "mean" if self.objective == "thompson" else self.objective
         return PredictedReturn(
@@ -299,7 +284,7 @@ class PolicySearch(Search):
             # direct reward models need none
             reward=_unknown if self.reward is None else self.reward,
             horizon=state.horizon,
-            initial_states=self._initial_states(data),
+            initial_states=first_states(state.data, self.initial_states),
             risk=risk,
             kappa=self.kappa,
             n_samples=copies * self.n_samples,
@@ -309,17 +294,8 @@ class PolicySearch(Search):
             every=self.every,
             policy=self.policy,
             random_state=seed,
-            **settings,
+            **signals_of(state),
         )
-
-    def _initial_states(self, data: TrajectoryDataset | None) -> Floats:
-        if self.initial_states is not None:
-            return np.atleast_2d(np.asarray(self.initial_states, dtype=np.float64))
-        if data is None:
-            raise ValueError("no trial was told, so give initial_states=.")
-        first = data.states[data.offsets[:-1]]
-        # trials that all begin alike need one prediction
-        return first[:1] if (first == first[0]).all() else first
 
     def _check_trials(self, ds: TrajectoryDataset) -> None:
         if not predicts_rewards(self.model):
@@ -330,7 +306,7 @@ class PolicySearch(Search):
             warn_of_ends(ds, self.is_terminal, self.horizon)
         if self.initial_states is None:
             return
-        width = self._initial_states(None).shape[1]
+        width = first_states(None, self.initial_states).shape[1]
         if width != len(ds.state_names):
             raise ValueError(
                 f"the trial has {len(ds.state_names)} states a step, initial_states= has {width}."
@@ -338,12 +314,31 @@ class PolicySearch(Search):
 
     # -- the model ------------------------------------------------------------------------
 
+    @property
+    def model_(self) -> Any:
+        """The model behind the last proposal or prediction; fitted on all trials if there is none.
+
+        As after `resume`.
+        """
+        if self._last_fit is None:
+            # raises unless something was told, or the model was fitted before
+            if not isinstance(self.model, FrozenEstimator):
+                _ = self.trials_
+            self._begun()
+            return self._fitted()
+        return self._last_fit[0]
+
+    def _go_on(self, state: Trials) -> None:
+        if state is not self._state:
+            self._last_fit = None
+        super()._go_on(state)
+
     def _fitted(self) -> Any:
         """The model fitted on all trials told; `model_` from then on."""
         state = self._told()
-        cached = (self.model, state.data, self.terminal_reward)
-        if _same(getattr(self, "_fitted_on", ()), cached):
-            return self.model_  # type: ignore[has-type]
+        key = (self.model, state.data, self.terminal_reward)
+        if self._last_fit is not None and _same(self._last_fit[1], key):
+            return self._last_fit[0]
         if isinstance(self.model, FrozenEstimator):
             model = self.model.estimator
         else:
@@ -353,7 +348,7 @@ class PolicySearch(Search):
             except Exception as error:
                 error.add_note(f"This was in fitting the model on the {len(state)} trial(s) told.")
                 raise
-        self.model_, self._fitted_on = model, cached
+        self._last_fit = model, key
         return model
 
     def _fit(self, model: Any) -> Any:
@@ -375,9 +370,7 @@ class PolicySearch(Search):
 
     def _ready(self) -> bool:
         state = self._told()
-        if len(state) < self.n_initial:
-            return False
-        if not _future_known(state):
+        if len(state) < self.n_initial or not future_known(state):
             return False
         if isinstance(self.model, FrozenEstimator):
             return True
@@ -404,12 +397,13 @@ class PolicySearch(Search):
             std=None if found.std is None else float(found.std[0]),
             violation=violation,
             source="model",
+            expected=None if found.expected is None else float(found.expected[0]),
         )
 
     def _maximum(self, model: Any, rng: np.random.Generator) -> tuple[Floats, int]:
         """The best params (p,) that the optimiser finds, and a seed to assess them with."""
         seed = int(rng.integers(2**31))
-        bounds, judged = self._told().bounds, model
+        judged = model
         if self.objective == "thompson":
             size = n_members(model)
             if size < 2:
@@ -418,57 +412,16 @@ class PolicySearch(Search):
                     "only: use an MLPEnsembleRegressor with n_members > 1, or another objective."
                 )
             judged = member_of(model, int(rng.integers(size)))
-        settings: dict[str, Any] = {
-            "n_evaluations": self.n_evaluations,
-            "rng": rng,
-            "start": self._start_points(),
-        }
-        method = self.optimizer
-        if method == "gradient":
-            from trajlearn.control._gradient import ascend
-
-            objective = self._objective(judged, seed, constrained=False)
-            found = ascend(objective, bounds, **settings).params
-            if self.constraint is None or self._keeps(model, seed, found):
-                return found, seed
-            # a share of trajectories has no gradient: go on without
-            method, known = "cma", settings["start"]
-            settings["start"] = found[None] if known is None else np.vstack([found, known])
-        if self.constraint is None:
-            objective = self._objective(judged, seed)
-            best = maximise(
-                lambda params: objective(params).value, bounds, method=method, **settings
-            )
-            return best.params, seed
-        # a crash is judged by all members
-        own = None if judged is model else self._objective(judged, seed, constrained=False)
-        rank = self._ranking(model, seed, own)
-        tried: list[tuple[Floats, Floats]] = []
-        maximise(
-            rank, bounds, method=method, on_batch=lambda *batch: tried.append(batch), **settings
+        limit = None if self.constraint is None else self.max_violation
+        return best_params(
+            Goal(self._objective, model, judged, limit),
+            self._told().bounds,
+            seed=seed,
+            optimizer=self.optimizer,
+            n_evaluations=self.n_evaluations,
+            rng=rng,
+            start=self._start_points(),
         )
-        # judged again, by other and more samples
-        chosen, before = best_to_worst(tried, _CONFIRMED)
-        seed = int(rng.integers(2**31))
-        again = self._ranking(model, seed, own, copies=_COPIES)(chosen)
-        return chosen[int(np.argmax(np.minimum(before, again)))], seed
-
-    def _ranking(
-        self, model: Any, seed: int, own: PredictedReturn | None, *, copies: int = 1
-    ) -> "Callable[[Floats], Floats]":
-        """Values of candidates, those that violate the constraint too often below all others."""
-        guard = self._objective(model, seed, copies=copies)
-
-        def rank(params: Floats) -> Floats:
-            found = guard(params)
-            wanted = found.value if own is None else own(params).value
-            return ranked(wanted, found.violation, self.max_violation)
-
-        return rank
-
-    def _keeps(self, model: Any, seed: int, params: Floats) -> bool:
-        violation = self._objective(model, seed, copies=_COPIES)(params[None]).violation
-        return violation is None or bool(violation[0] <= self.max_violation)
 
     def _start_points(self) -> Floats | None:
         """The best params tried and the last ones proposed, inside the bounds (k, p)."""
@@ -478,12 +431,6 @@ class PolicySearch(Search):
         if not points:
             return None
         return np.clip(np.unique(points, axis=0), *state.bounds.T)
-
-
-def _future_known(state: Trials) -> bool:
-    """Whether the references of the next trial are known, if it has any."""
-    data = state.data
-    return data is None or data.references is None or bool(data.lengths.max() >= state.horizon)
 
 
 def _unknown(states: Floats) -> Floats:

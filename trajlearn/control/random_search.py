@@ -1,12 +1,8 @@
 """The search without a model."""
 
-from typing import Any, ClassVar
-
 import numpy as np
-from numpy.typing import ArrayLike
 
 from trajlearn.control.search import Proposal, Search
-from trajlearn.trajectories.rewards import Reward
 
 __all__ = ["RandomSearch"]
 
@@ -58,29 +54,6 @@ class RandomSearch(Search):
     >>> bool(search.best_reward_ > -0.1)
     True
     """
-
-    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        name: allowed
-        for name, allowed in Search._parameter_constraints.items()
-        if name != "n_initial"
-    }
-
-    def __init__(
-        self,
-        *,
-        bounds: ArrayLike,
-        reward: Reward | None = None,
-        horizon: int,
-        terminal_reward: float | None = None,
-        random_state: Any = None,
-        verbose: int = 0,
-    ) -> None:
-        self.bounds = bounds
-        self.reward = reward
-        self.horizon = horizon
-        self.terminal_reward = terminal_reward
-        self.random_state = random_state
-        self.verbose = verbose
 
     def _ready(self) -> bool:
         return False

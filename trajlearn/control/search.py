@@ -12,9 +12,11 @@ from sklearn.base import BaseEstimator
 from sklearn.utils import check_random_state, check_scalar
 
 from trajlearn._sklearn import Interval
+from trajlearn.control._history import history_of
 from trajlearn.control._optimizers import checked_bounds
-from trajlearn.control._search_file import read_search, write_search
-from trajlearn.control._trials import Proposal, Trials, joined, measured
+from trajlearn.control._search_file import read_search, taken_up, write_search
+from trajlearn.control._trial_returns import check_same_reward, measured
+from trajlearn.control._trials import Proposal, Trials, joined
 from trajlearn.trajectories import Trajectory, TrajectoryDataset, as_dataset
 from trajlearn.trajectories.rewards import Reward
 
@@ -38,20 +40,31 @@ class Search(BaseEstimator):
         "bounds": ["array-like"],
         "reward": [callable, None],
         "horizon": [Interval(Integral, 1, None, closed="left")],
-        "n_initial": [Interval(Integral, 1, None, closed="left")],
         "terminal_reward": [Interval(Real, None, None, closed="neither"), None],
         "random_state": ["random_state"],
         "verbose": ["verbose"],
     }
 
-    bounds: ArrayLike
-    reward: Reward | None
-    horizon: int
+    # of those searches that begin with Sobol points
     n_initial: int
-    terminal_reward: float | None
-    random_state: Any
-    verbose: int
     _state: Trials | None = None
+
+    def __init__(
+        self,
+        *,
+        bounds: ArrayLike,
+        reward: Reward | None = None,
+        horizon: int,
+        terminal_reward: float | None = None,
+        random_state: Any = None,
+        verbose: int = 0,
+    ) -> None:
+        self.bounds = bounds
+        self.reward = reward
+        self.horizon = horizon
+        self.terminal_reward = terminal_reward
+        self.random_state = random_state
+        self.verbose = verbose
 
     # -- what a search defines ------------------------------------------------------------
 
@@ -144,14 +157,7 @@ class Search(BaseEstimator):
 
     def _agree(self, state: Trials, when: str) -> None:
         """Raise if bounds or horizon are not those of a state."""
-        bounds = checked_bounds(self.bounds)
-        differing = []
-        if bounds.shape != state.bounds.shape:
-            differing.append(f"p = {len(bounds)} here, {len(state.bounds)} there")
-        elif not np.array_equal(bounds, state.bounds):
-            differing.append(f"bounds = {bounds.tolist()} here, {state.bounds.tolist()} there")
-        if self.horizon != state.horizon:
-            differing.append(f"horizon = {self.horizon} here, {state.horizon} there")
+        differing = state.differing(checked_bounds(self.bounds), self.horizon)
         if differing:
             raise ValueError(
                 f"{type(self).__name__} differs from when {when}: {'; '.join(differing)}. Build a "
@@ -245,31 +251,26 @@ class Search(BaseEstimator):
         -------
         DataFrame
             ``trial``; the params by name; ``return``; ``best`` so far; ``predicted``,
-            ``predicted_std`` and ``violation`` of the proposal, averaged over the initial states
-            that the model was asked about, so that a single trial scatters more (NaN where
-            nothing was predicted); ``n_steps``; ``terminated``; ``source`` (``"sobol"``,
-            ``"model"``, ..., ``"logged"`` if the trial did not follow the proposal).
+            ``expected``, ``predicted_std`` and ``violation`` of the proposal, averaged over the
+            initial states that the model was asked about, so that a single trial scatters more
+            (NaN where nothing was predicted); ``n_steps``; ``terminated``; ``source``
+            (``"sobol"``, ``"model"``, ..., ``"logged"`` if the trial did not follow the
+            proposal). ``predicted_std`` is about ``expected``, the mean return; ``predicted`` may
+            be the return of the mean trajectory.
         """
-        import pandas as pd
+        return history_of(self._told(), self.terminal_reward, self.trials_)
 
-        state, data = self._told(), self.trials_
-        records, returns = state.records, state.returns(self.terminal_reward)
-        best = np.maximum.accumulate(np.where(np.isnan(returns), -np.inf, returns))
-        columns = {
-            "return": returns,
-            "best": np.where(np.isinf(best), np.nan, best),
-            "predicted": records["predicted"],
-            "predicted_std": records["std"],
-            "violation": records["violation"],
-            "n_steps": data.lengths,
-            "terminated": data.terminated,
-            "source": records["source"].astype(object),
-        }
-        params = {
-            f"params.{name}" if name in (*columns, "trial") else name: values
-            for name, values in zip(data.param_names, records["params"].T, strict=True)
-        }
-        return pd.DataFrame({"trial": np.arange(len(data)), **params, **columns})
+    def _candidates(self, params: ArrayLike) -> Floats:
+        """Params (m, p) that a model is asked about."""
+        n_params = len(self._begun().bounds)
+        candidates = np.atleast_2d(np.asarray(params, dtype=np.float64))
+        if candidates.ndim != 2 or candidates.shape[1] != n_params:
+            raise ValueError(
+                f"params has shape {np.shape(params)}; expected (m, {n_params}), as bounds= says."
+            )
+        if not np.isfinite(candidates).all():
+            raise ValueError("params has NaN or infinite values.")
+        return candidates
 
     # -- a simulator ----------------------------------------------------------------------
 
@@ -355,25 +356,9 @@ class Search(BaseEstimator):
         """Go on from a file, if it is there; how many proposals it is ahead."""
         if not Path(path).is_file():
             return 0
-        mine, found = self._told(), self._read(path)
-        n = min(len(mine), len(found))
-        if n:
-            assert mine.data is not None
-            assert found.data is not None
-            old, new = mine.data[:n], found.data[:n]
-            if not (
-                np.array_equal(old.offsets, new.offsets) and np.array_equal(old.states, new.states)
-            ):
-                raise ValueError(
-                    f"{path} holds a search with other trials than this one: give another path, "
-                    "or resume(path) in a new search."
-                )
-        if len(found) < len(mine) or found.n_asked < mine.n_asked:
-            return 0
-        self._state = found
-        # a proposal that waits for its trial is still to be run
-        ahead = [state.n_asked - (state.pending is not None) for state in (found, mine)]
-        return max(ahead[0] - ahead[1], 0)
+        state, n_ahead = taken_up(self._told(), self._read(path), path)
+        self._go_on(state)
+        return n_ahead
 
     # -- files ----------------------------------------------------------------------------
 
@@ -403,17 +388,27 @@ class Search(BaseEstimator):
         Raises
         ------
         ValueError
-            If the file is of a search of another class, bounds or horizon.
+            If the file is of a search of another class, bounds or horizon, or of another reward:
+            one that sums up to other returns than those of its trials.
         UnknownFileError
             If it is truncated, changed, or of another kind.
         """
         self._validate_params()
-        self._state = self._read(path)
+        self._go_on(self._read(path))
         return self
+
+    def _go_on(self, state: Trials) -> None:
+        """Go on from another state."""
+        self._state = state
 
     def _read(self, path: str | Path) -> Trials:
         name, state = read_search(path)
         if name != type(self).__name__:
             raise ValueError(f"{path} holds a {name}, not a {type(self).__name__}.")
         self._agree(state, f"{path} was saved")
+        try:
+            check_same_reward(state, self.reward)
+        except Exception as error:
+            error.add_note(f"This was in summing up the trials of {path} again.")
+            raise
         return state

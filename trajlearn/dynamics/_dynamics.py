@@ -233,13 +233,8 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
         wanted = np.atleast_1d(np.asarray(horizons, dtype=np.float64))
         if wanted.ndim != 1 or not len(wanted) or wanted[0] <= 0 or (np.diff(wanted) <= 0).any():
             raise ValueError("horizons must be positive and strictly increasing times.")
-        grid, chosen = self._time_grid(wanted)
-        rolled = isinstance(self.baseline_, DynamicsEstimator) and self.baseline_._rolls_out
-        if rolled:
-            grid, chosen = self.baseline_._time_grid(wanted)
+        grid, chosen = self.planning_grid(wanted, references=callable(references))
         if callable(references):
-            if not rolled:
-                grid, chosen = self._looked_at(grid, chosen)
             references = np.asarray(references(np.concatenate([[0.0], grid])), dtype=np.float64)
         if params is not None and np.ndim(params) == 2 and len(states) == 1:
             states = np.repeat(states, len(np.asarray(params)), axis=0)
@@ -270,6 +265,30 @@ class DynamicsEstimator(Forecaster, TwoDoorRegressor):
             random_state=random_state,
         )
         return forecast.at(chosen + 1)._replace(horizons=wanted)
+
+    def planning_grid(
+        self, horizons: Floats, *, references: bool
+    ) -> tuple[Floats, NDArray[np.intp]]:
+        """Times at which an episode that has only begun is to have states, for some horizons.
+
+        Parameters
+        ----------
+        horizons : ndarray of shape (k,)
+        references : bool
+            Whether references are known at any time, so that more of them can be looked at.
+
+        Returns
+        -------
+        times : ndarray of shape (h,)
+            After the start.
+        chosen : ndarray of shape (k,)
+            Which of them are the horizons.
+        """
+        baseline = self.baseline_
+        if isinstance(baseline, DynamicsEstimator) and baseline._rolls_out:
+            return baseline._time_grid(horizons)
+        grid, chosen = self._time_grid(horizons)
+        return self._looked_at(grid, chosen) if references else (grid, chosen)
 
     def _time_grid(self, horizons: Floats) -> tuple[Floats, NDArray[np.intp]]:
         """Times to compute, and which of them are the horizons asked for."""

@@ -15,12 +15,14 @@ __all__ = ["plot_search", "plot_slices"]
 
 Floats = NDArray[np.float64]
 _CROSS: dict[str, Any] = {"marker": "X", "ms": 8}
+_MEAN_PATH = "of the mean trajectory"
 
 
 class _Assessed(Protocol):
     """What a model predicts for candidates."""
 
     reward: Floats
+    expected: Floats | None
     std: Floats | None
 
 
@@ -51,8 +53,10 @@ def plot_search(search: _Search, ax: "Axes | None" = None) -> "Axes":
     Returns
     -------
     matplotlib Axes
-        Grey: trials that were logged, not proposed. A cross marks a trial that ended early; an
-        error bar is one predicted standard deviation to each side.
+        Grey: trials that were logged, not proposed. A cross marks a trial that ended early. A
+        diamond is the expected return of a proposal, with one predicted standard deviation to
+        each side; a dash, where it differs, the return of the mean trajectory, which the
+        objective "mean" maximises.
 
     Raises
     ------
@@ -99,19 +103,25 @@ def plot_search(search: _Search, ax: "Axes | None" = None) -> "Axes":
     predicted = history["predicted"].to_numpy(dtype=np.float64)
     if np.isfinite(predicted).any():
         std = history["predicted_std"].to_numpy(dtype=np.float64)
+        expected = history["expected"].to_numpy(dtype=np.float64)
+        centre = np.where(np.isnan(expected), predicted, expected)
         # beside its trial, so that one does not hide the other
-        aside = 0.12 + 0.004 * len(number)
+        aside = number + 0.12 + 0.004 * len(number)
+        colour = line_style(1)["color"]
         ax.errorbar(
-            number + aside,
-            predicted,
+            aside,
+            centre,
             std if np.isfinite(std).any() else None,
             fmt="D",
             ms=5,
             mfc="white",
             capsize=3,
-            color=line_style(1)["color"],
+            color=colour,
             label="predicted",
         )
+        if (other := _differs(predicted, centre)).any():
+            label = f"predicted, {_MEAN_PATH}"
+            ax.plot(aside[other], predicted[other], "_", ms=11, mew=2, color=colour, label=label)
     ax.set_xlabel("trial")
     ax.set_ylabel("return")
     ax.set_xlim(number[0] - 0.5, number[-1] + 0.5)
@@ -144,9 +154,10 @@ def plot_slices(
     Returns
     -------
     ndarray of matplotlib Axes of shape (p,)
-        Shaded: one standard deviation of the predicted return to each side, where the model gives
-        one. The vertical line is `params`; ticks above the panel are the values tried so far,
-        where they are within its range.
+        Line: the expected return; shaded: one standard deviation to each side, where the model
+        gives one. Dashed, where it differs: the return of the mean trajectory, which the
+        objective "mean" maximises. The vertical line is `params`; ticks above the panel are the
+        values tried so far, where they are within its range.
 
     Raises
     ------
@@ -189,7 +200,7 @@ def plot_slices(
         raise ValueError("params has NaN or infinite values.")
     history = search.history()
     names = list(history.columns[1 : 1 + n_params])
-    first_of_row = slice(0, 1)
+    first_of_row, own_figure = slice(0, 1), axes is None
     if axes is None:
         across = min(n_params, 4)
         down = -(-n_params // across)
@@ -211,14 +222,19 @@ def plot_slices(
     for i, (low, high) in enumerate(bounds):
         lines[i, :, i] = np.linspace(low, high, n_points)
     assessed = search.predict_return(lines.reshape(-1, n_params))
-    means = assessed.reward.reshape(n_params, n_points)
+    of_mean_path = assessed.reward.reshape(n_params, n_points)
+    expected = assessed.reward if assessed.expected is None else assessed.expected
+    means = expected.reshape(n_params, n_points)
+    two_lines = _differs(of_mean_path, means).any()
     colour = line_style(0)["color"]
     for i, (ax, name) in enumerate(zip(panels, names)):
         x = lines[i, :, i]
         if assessed.std is not None:
             std = assessed.std.reshape(n_params, n_points)[i]
             ax.fill_between(x, means[i] - std, means[i] + std, color=colour, alpha=0.25, lw=0)
-        ax.plot(x, means[i], color=colour, lw=1.6)
+        ax.plot(x, means[i], color=colour, lw=1.6, label="expected")
+        if two_lines:
+            ax.plot(x, of_mean_path[i], color=INK, lw=1.3, ls="dashed", label=_MEAN_PATH)
         ax.axvline(through[i], color=INK, lw=1, ls="dotted")
         ends = [min(x[0], through[i]), max(x[-1], through[i])]
         margin = 0.04 * (ends[1] - ends[0])
@@ -234,4 +250,16 @@ def plot_slices(
         tidy(ax)
     for ax in panels[first_of_row]:
         ax.set_ylabel("predicted return")
+    if two_lines:
+        looks: dict[str, Any] = {"ncols": 2, "frameon": False, "fontsize": "small"}
+        if own_figure:
+            lines_of = panels[0].get_legend_handles_labels()
+            panels[0].figure.legend(*lines_of, loc="outside upper left", **looks)
+        else:
+            panels[0].legend(loc="lower left", bbox_to_anchor=(0, 1.03), **looks)
     return panels
+
+
+def _differs(a: Floats, b: Floats) -> NDArray[np.bool_]:
+    """Where two predictions of a return are not the same, by more than rounding."""
+    return ~np.isclose(a, b, rtol=1e-6, equal_nan=True)

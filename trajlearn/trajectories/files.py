@@ -1,25 +1,23 @@
 """Files: ``.npz`` without pickle, and ``.parquet``; written whole or not at all."""
 
 import json
-import os
-import secrets
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from trajlearn.exceptions import UnknownFileError
+from trajlearn.trajectories._archive import FileKind, ForeignFileError, read_file, write_file
 from trajlearn.trajectories._columns import EPISODE_FIELDS, STATE_FIELDS, STEP_FIELDS
 from trajlearn.trajectories._extras import import_extra
 from trajlearn.trajectories._flat import assemble
 from trajlearn.trajectories.dataset import TrajectoryDataset
 from trajlearn.trajectories.frames import build_table, column_labels
 
-__all__ = ["load_dataset", "save_dataset"]
+__all__ = ["load_dataset", "read_npz", "save_dataset", "write_npz"]
 
-_FORMAT, _VERSION = "trajlearn.dataset", 1
+_KIND = FileKind("trajlearn.dataset", 1, "dataset")
 # Where Parquet keeps our header, and the column that tells where an episode begins: ids repeat
 # in a bootstrap sample.
 _KEY, _STEP = b"trajlearn", "step"
@@ -55,8 +53,8 @@ def save_dataset(ds: TrajectoryDataset, path: str | Path) -> None:
     True
     """
     path = Path(path)
-    write = {".npz": _write_npz, ".parquet": _write_parquet}[_suffix(path)]
-    _replace(path, lambda handle: write(ds, handle))
+    write = {".npz": write_npz, ".parquet": _write_parquet}[_suffix(path)]
+    write_file(path, lambda handle: write(ds, handle))
 
 
 def load_dataset(path: str | Path) -> TrajectoryDataset:
@@ -80,25 +78,10 @@ def load_dataset(path: str | Path) -> TrajectoryDataset:
         For Parquet without pyarrow.
     """
     path = Path(path)
-    read = {".npz": _read_npz, ".parquet": _read_parquet}[_suffix(path)]
+    read = {".npz": read_npz, ".parquet": _read_parquet}[_suffix(path)]
     if read is _read_parquet:
         _pyarrow()
-    with path.open("rb") as handle:
-        try:
-            return read(handle)
-        except _Foreign as error:
-            raise UnknownFileError(f"{path}: {error}") from error
-        # A damaged file fails in any of a dozen ways: zip, zlib, numpy's and Arrow's own
-        # errors, JSON, missing keys, memory for absurd sizes, and our validation.
-        except Exception as error:
-            raise UnknownFileError(
-                f"{path} is damaged: truncated, or changed after it was saved "
-                f"({type(error).__name__}: {error}). Save the dataset again, or take a backup."
-            ) from error
-
-
-class _Foreign(Exception):
-    """A sound file that is not ours."""
+    return read_file(path, read)
 
 
 def _suffix(path: Path) -> str:
@@ -111,60 +94,30 @@ def _suffix(path: Path) -> str:
     )
 
 
-def _replace(path: Path, write: Callable[[IO[bytes]], None]) -> None:
-    """Write beside `path` and move into place, so that no reader sees half a file."""
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
-    try:
-        with temporary.open("xb") as handle:
-            write(handle)
-            handle.flush()
-            os.fsync(handle.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def _check_header(header: Any) -> dict[str, Any]:
-    if not isinstance(header, dict) or header.get("format") != _FORMAT:
-        raise _Foreign("this is not a dataset that trajlearn saved.")
-    if header.get("version") != _VERSION:
-        raise _Foreign(
-            f"the file has version {header.get('version')!r} of the format, this package reads "
-            f"{_VERSION}. Use the version of trajlearn that wrote it, or a newer one."
-        )
-    return header
-
-
 # -- npz: one array a field, and a JSON header ------------------------------------------------
 
 
-def _write_npz(ds: TrajectoryDataset, handle: IO[bytes]) -> None:
+def write_npz(ds: TrajectoryDataset, handle: IO[bytes]) -> None:
+    """Write a dataset into an open file."""
     columns = ds._columns
-    header = {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "names": {field: list(names) for field, names in ds._names.items()},
-        "context": list(columns.context),
-        "params_per_step": columns.params_per_step,
-        "hindsight": columns.hindsight,
-    }
-    arrays = {"header": np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)}
-    arrays["counts"] = np.diff(columns.offsets)
+    header = _KIND.header(
+        names={field: list(names) for field, names in ds._names.items()},
+        context=list(columns.context),
+        params_per_step=columns.params_per_step,
+        hindsight=columns.hindsight,
+    )
+    arrays = {"counts": np.diff(columns.offsets)}
     for field in (*STATE_FIELDS, *STEP_FIELDS, *EPISODE_FIELDS, "params"):
         if getattr(columns, field) is not None:
             arrays[field] = getattr(columns, field)
     for i, values in enumerate(columns.context.values()):
         arrays[f"context{i}"] = values
-    np.savez(handle, allow_pickle=False, **arrays)
+    _KIND.write_npz(handle, header, arrays)
 
 
-def _read_npz(handle: IO[bytes]) -> TrajectoryDataset:
-    archive = np.load(handle, allow_pickle=False)
-    if not isinstance(archive, np.lib.npyio.NpzFile) or "header" not in archive.files:
-        raise _Foreign("this is not a dataset that trajlearn saved.")
-    with archive:
-        arrays = {name: archive[name] for name in archive.files}
-    header = _check_header(json.loads(arrays.pop("header").tobytes()))
+def read_npz(handle: IO[bytes]) -> TrajectoryDataset:
+    """Read from an open file what `write_npz` wrote."""
+    header, arrays = _KIND.read_npz(handle)
     context = {key: arrays.pop(f"context{i}").tolist() for i, key in enumerate(header["context"])}
     group = arrays.pop("group", None)
     return assemble(
@@ -194,16 +147,14 @@ def _write_parquet(ds: TrajectoryDataset, handle: IO[bytes]) -> None:
         labels = {
             field: [f"{field}.{name}" for name in columns] for field, columns in labels.items()
         }
-    header = {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "names": {field: list(names) for field, names in ds._names.items()},
-        "context": list(ds.context),
-        "columns": labels,
-        "crc32": _checksum(ds),
-        "params_per_step": ds.params_vary,
-        "hindsight": ds.hindsight,
-    }
+    header = _KIND.header(
+        names={field: list(names) for field, names in ds._names.items()},
+        context=list(ds.context),
+        columns=labels,
+        crc32=_checksum(ds),
+        params_per_step=ds.params_vary,
+        hindsight=ds.hindsight,
+    )
     frame = build_table(ds, labels, ds.ids)
     position = np.arange(len(frame)) - np.repeat(ds.offsets[:-1], ds.lengths + 1)
     frame.insert(1, _STEP, position)
@@ -217,11 +168,11 @@ def _read_parquet(handle: IO[bytes]) -> TrajectoryDataset:
     file = parquet.ParquetFile(handle, page_checksum_verification=True)
     metadata = file.schema_arrow.metadata or {}
     if _KEY not in metadata:
-        raise _Foreign(
+        raise ForeignFileError(
             "this Parquet file was not saved by trajlearn. For a table of your own use "
             "from_frame(pandas.read_parquet(path), ...)."
         )
-    header = _check_header(json.loads(metadata[_KEY]))
+    header = _KIND.checked(json.loads(metadata[_KEY]))
     table, labels = file.read(), header["columns"]
 
     def values(column: str) -> Any:

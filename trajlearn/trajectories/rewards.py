@@ -11,7 +11,7 @@ from trajlearn.exceptions import MissingFieldError
 from trajlearn.trajectories.dataset import TrajectoryDataset
 from trajlearn.trajectories.trajectory import Trajectory
 
-__all__ = ["Reward", "episode_rewards", "step_rewards"]
+__all__ = ["Reward", "episode_rewards", "rewards_of", "step_rewards"]
 
 Reward = Callable[..., NDArray[np.float64]]
 _MAY_NAME = ("actions", "references", "times")
@@ -95,12 +95,13 @@ def episode_rewards(
         raise ValueError(f"start {start} leaves no step, or horizon {horizon} is below 1.")
     sums = np.empty(len(ds))
     for i, episode in enumerate(ds):
-        values = _logged(episode, reward)[start : start + steps]
+        values = rewards_of(episode, reward)[start : start + steps]
         sums[i] = values.sum() + _missing(episode, steps - len(values), terminal_reward)
     return sums / steps
 
 
-def _logged(episode: Trajectory, reward: Reward | None) -> NDArray[np.float64]:
+def rewards_of(episode: Trajectory, reward: Reward | None) -> NDArray[np.float64]:
+    """Reward of each step of an episode (T,), from a function or, if None, as logged."""
     if reward is None:
         assert episode.rewards is not None  # checked once for the dataset
         return episode.rewards
