@@ -8,7 +8,7 @@ import pytest
 from safetensors.numpy import save_file
 from sklearn.base import clone
 from sklearn.ensemble import RandomForestRegressor
-from sklearn.linear_model import LinearRegression
+from sklearn.linear_model import Lasso
 from sklearn.preprocessing import (
     FunctionTransformer,
     MaxAbsScaler,
@@ -212,7 +212,7 @@ def test_two_functions_of_one_name_are_told_apart(ds, path):
     assert not path.exists()
 
 
-@pytest.mark.parametrize("learner", [RandomForestRegressor(2), LinearRegression()])
+@pytest.mark.parametrize("learner", [RandomForestRegressor(2), Lasso()])
 def test_learners_of_others_are_refused_naming_joblib(learner, ds, path):
     model = TrajectoryRegressor(learner, relabeler=SubtrajectoryRelabeler(max_rows=50)).fit(ds)
     with pytest.raises(TypeError, match=r"(?s)cannot be stored.*joblib\.dump.*trust"):
@@ -241,7 +241,7 @@ def test_a_failed_save_keeps_the_old_file(ds, path):
     t().fit(ds).save(path)
     before = path.read_bytes()
     with pytest.raises(TypeError):
-        TrajectoryRegressor(LinearRegression()).fit(ds).save(path)
+        TrajectoryRegressor(Lasso()).fit(ds).save(path)
     assert path.read_bytes() == before
     assert [p.name for p in path.parent.iterdir()] == [path.name]
 

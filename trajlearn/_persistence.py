@@ -56,7 +56,7 @@ _CLASSES = {
         "trajlearn.trajectories._columns": ("Columns",),
         "trajlearn.trajectories._layout": ("Layout",),
         "trajlearn.envs": ("AttitudePD",),
-        "trajlearn.policies": ("LinearFeedback", "PID"),
+        "trajlearn.policies": ("LinearFeedback", "NetworkPolicy", "PID"),
         "sklearn.frozen": ("FrozenEstimator",),
         "sklearn.preprocessing": (
             "FunctionTransformer",

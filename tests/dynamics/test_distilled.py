@@ -6,13 +6,15 @@ from sklearn.base import BaseEstimator, clone
 from sklearn.frozen import FrozenEstimator
 from sklearn.linear_model import LinearRegression
 from sklearn.model_selection import GridSearchCV
-from sklearn.pipeline import Pipeline
+from sklearn.pipeline import Pipeline, make_pipeline
 
 from tests.dynamics.systems import SMALL, gain_policy, linear
 from trajlearn import (
     BlockScaler,
+    KalmanSmoother,
     LSTMRegressor,
     OneStepRegressor,
+    ParamsTransformer,
     SubtrajectoryRelabeler,
     TrajectoryDataset,
     TrajectoryRegressor,
@@ -48,6 +50,22 @@ def exact(**settings):
 def distilled(teacher=None, student=T, **settings):
     settings = {"param_bounds": BOUNDS, "n_imagined": 20, "random_state": 0} | settings
     return DistilledForecaster(teacher or exact(), student, **settings)
+
+
+class Unsure(BaseEstimator):
+    """Teacher whose mean is that of a few particles; it says nothing of policies and inputs."""
+
+    def __init__(self, policy=None):
+        self.policy = policy
+
+    def fit(self, X, y=None):
+        self.model_ = exact().fit(X)
+        return self
+
+    def predict(self, X, *, random_state=None, **settings):
+        found = self.model_.predict(X, **settings)
+        noise = np.random.default_rng(random_state).normal(size=found.mean.shape)
+        return found._replace(mean=found.mean + noise)
 
 
 class Recorder(BaseEstimator):
@@ -152,6 +170,28 @@ def test_other_signals_are_those_of_a_logged_episode():
         assert (episode.references == ds[of].references[0]).all()
 
 
+def test_where_the_time_step_varies_episodes_end_with_the_log():
+    times = [np.cumsum(np.linspace(0.5, 1.5, k)) for k in (9, 7)]
+    states = [np.sin(t)[:, None] for t in times]
+    ds = TrajectoryDataset.from_arrays(states, params=[[1.0], [2.0]], times=times)
+    teacher = OneStepRegressor(LinearRegression(), inputs=("params", "dt"))
+    imagined = distilled(teacher, Recorder(), param_bounds=None).fit(ds).imagined_
+    assert set(imagined.lengths) == {8, 6}
+    for episode in imagined:
+        of = 0 if episode.length == 8 else 1
+        np.testing.assert_array_equal(episode.times, times[of])
+        assert episode.states[0] == states[of][0]
+    short = distilled(teacher, Recorder(), param_bounds=None, horizon=5).fit(ds).imagined_
+    assert set(short.lengths) == {5}
+
+
+def test_a_seed_fixes_what_particles_imagine():
+    models = [distilled(Unsure(), Recorder(), random_state=seed).fit(LOG) for seed in (1, 1, 2)]
+    assert models[0].imagined_ == models[1].imagined_ != models[2].imagined_
+    table = [model.set_params(student=T).fit(LOG).fidelity(LOG) for model in models[:2]]
+    np.testing.assert_array_equal(table[0], table[1])
+
+
 def test_weights_count_as_repeated_episodes():
     weighted = distilled(student=Recorder()).fit(LOG, sample_weight=[2, 0, 1])
     repeated = distilled(student=Recorder()).fit(LOG[[0, 0, 2]])
@@ -160,6 +200,18 @@ def test_weights_count_as_repeated_episodes():
     np.testing.assert_array_equal(weighted.student_.weight_, [2, 1] + [1] * 20)
     model = distilled(student=Recorder(), weight_logged=5.0).fit(LOG)
     np.testing.assert_array_equal(model.student_.weight_, [5] * 3 + [1] * 20)
+
+
+def test_weights_reach_the_last_step_of_a_pipeline_or_are_refused():
+    student = make_pipeline(ParamsTransformer(np.square), Recorder())
+    model = distilled(student=student, weight_logged=5.0).fit(LOG)
+    np.testing.assert_array_equal(model.student_[-1].weight_, [5] * 3 + [1] * 20)
+    with pytest.raises(TypeError, match="Unsure does not take sample_weight"):
+        distilled(Unsure()).fit(LOG, sample_weight=[1, 2, 1])
+    # a factor on all says nothing
+    assert (
+        distilled(Unsure(), Recorder()).fit(LOG, sample_weight=[2, 2, 2]).student_.weight_[0] == 2
+    )
 
 
 def test_groups_of_the_log_stay_together_and_imagined_ones_stand_alone():
@@ -210,6 +262,72 @@ def test_fidelity_is_infinite_where_the_teacher_diverges():
     table = model.fidelity(test, horizons=[1, 30])
     np.testing.assert_array_equal(np.isinf(table["student_teacher"]), [False, True])
     assert np.isfinite(table["student"]).all()
+
+
+def test_fidelity_compares_the_steps_that_both_forecast():
+    theta = np.repeat(LOG.params[:, None], 30, axis=1)
+    theta[0, 12:] = 0.6
+    test = LOG.assign(params=list(theta))
+    model = distilled().fit(LOG)
+    # the student ends where theta changes
+    table = model.fidelity(test, horizons=[12, 13])
+    assert list(table["n"]) == [3, 2]
+    # beyond, the teacher is off, too: the states are those of the first theta
+    assert (table["teacher"] < 1e-9).all()
+    assert len(model.fidelity(test[:1])) == 12
+    with pytest.raises(ValueError, match="from 1 to 12, the longest forecast of both"):
+        model.fidelity(test[:1], horizons=[13])
+
+
+@pytest.mark.filterwarnings("ignore::trajlearn.exceptions.SmoothingWarning")
+def test_states_that_a_smoother_appends_are_told_from_the_logged_ones():
+    smoother = KalmanSmoother(append_velocities=True, measurement_noise=1e-3)
+    teacher = make_pipeline(smoother, OneStepRegressor(LinearRegression(), inputs="params"))
+    model = distilled(teacher, make_pipeline(smoother, T)).fit(LOG)
+    assert model.imagined_.state_names == ("s0",)
+    forecast = model.predict(LOG)
+    assert forecast.state_names == ("s0", "d_s0")
+    np.testing.assert_array_equal(forecast.state_range[:, 0], [-2.0, 1.5])
+    assert forecast.state_range.shape == (2, 2)
+    table = model.fidelity(LOG, horizons=[3])
+    gap = forecast.mean[:, 2, 0] - model.teacher_.predict(LOG).mean[:, 2, 0]
+    np.testing.assert_allclose(table["student_teacher"], np.sqrt(np.mean((gap / 3.5) ** 2)))
+
+
+def test_a_teacher_that_leaves_states_out_is_refused():
+    ds = linear(3, shortest=5, longest=5)
+
+    class Blind(Unsure):
+        def fit(self, X, y=None):
+            self.model_ = TrajectoryRegressor(LinearRegression()).fit(X.select_states(["s1"]))
+            return self
+
+        def predict(self, X, *, random_state=None, **settings):
+            return self.model_.predict(X.select_states(["s1"]), **settings)
+
+    with pytest.raises(
+        ValueError, match=r"teacher \(Blind\) predicts the states \['s1'\].*\['s0'\]"
+    ):
+        distilled(Blind(), Recorder(), param_bounds=None).fit(ds)
+
+
+def test_it_plans_if_the_student_does():
+    assert hasattr(DistilledForecaster(), "predict_trajectory")
+    assert not hasattr(distilled(student=make_pipeline(T)), "predict_trajectory")
+
+
+def test_a_fit_that_fails_leaves_the_one_before():
+    class Late(Recorder):
+        def fit(self, X, y=None, *, sample_weight=None):
+            raise RuntimeError("late")
+
+    model = distilled().fit(LOG)
+    before = vars(model).copy()
+    with pytest.raises(RuntimeError, match="late"):
+        model.set_params(student=Late()).fit(LOG[:2])
+    fitted = [name for name in before if name.endswith("_")]
+    assert "teacher_" in fitted
+    assert all(getattr(model, name) is before[name] for name in fitted)
 
 
 def test_forecasts_are_the_students():

@@ -11,10 +11,11 @@ from trajlearn.dynamics.calibrated import CalibratedForecaster
 from trajlearn.dynamics.direct_reward import DirectRewardGP, DirectRewardNN
 from trajlearn.dynamics.distilled import DistilledForecaster
 from trajlearn.dynamics.forecast import Forecast
+from trajlearn.dynamics.horizon import HorizonFeatures
 from trajlearn.dynamics.lstm import LSTMRegressor
 from trajlearn.dynamics.one_step import OneStepRegressor
 from trajlearn.dynamics.phase import PhaseFeatures
-from trajlearn.dynamics.scaling import BlockScaler, HorizonFeatures
+from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.dynamics.trajectory import TrajectoryRegressor
 
 __all__ = [

@@ -11,6 +11,7 @@ from sklearn.utils.validation import _check_sample_weight, check_is_fitted, vali
 
 from trajlearn._persistence import SaveMixin
 from trajlearn._sklearn import HasMethods, fit_context
+from trajlearn.dynamics._episode_arguments import checked_weight
 from trajlearn.dynamics._learner import Moments, fit_learner, mixture, moments_of, seeded
 from trajlearn.dynamics._nested_defaults import NestedDefaults
 from trajlearn.dynamics.scaling import BlockScaler
@@ -131,14 +132,7 @@ class TwoDoorRegressor(SaveMixin, RegressorMixin, NestedDefaults):
     def _fit_door_of_episodes(self, ds: TrajectoryDataset, sample_weight: Any, groups: Any) -> None:
         weight = None
         if sample_weight is not None:
-            weight = np.asarray(sample_weight, dtype=np.float64)
-            if weight.shape != (len(ds),) or not np.isfinite(weight).all() or (weight < 0).any():
-                raise ValueError(
-                    f"sample_weight needs one finite weight >= 0 an episode ({len(ds)}); got "
-                    f"shape {weight.shape}."
-                )
-            if not weight.any():
-                raise ValueError("sample_weight is zero everywhere; give an episode some weight.")
+            weight = checked_weight(sample_weight, len(ds))
         if groups is None:
             groups = np.arange(len(ds)) if ds.group is None else ds.group
         groups = np.asarray(groups)

@@ -6,14 +6,13 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from sklearn.frozen import FrozenEstimator
+from sklearn.pipeline import Pipeline
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
+from trajlearn.dynamics._members import inside
 from trajlearn.dynamics._planned import by_episode, planned
-from trajlearn.dynamics.calibrated import CalibratedForecaster
-from trajlearn.dynamics.distilled import DistilledForecaster
-from trajlearn.dynamics.scaling import BlockScaler, _affine
+from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.dynamics.trajectory import TrajectoryRegressor
 from trajlearn.regressors._device import find_device
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
@@ -22,12 +21,6 @@ __all__ = ["DifferentiableTrajectory", "differentiable"]
 
 Floats = NDArray[np.float64]
 
-# what predicts inside an estimator whose means are those of another
-_INSIDE = {
-    CalibratedForecaster: "estimator_",
-    DistilledForecaster: "student_",
-    FrozenEstimator: "estimator",
-}
 _ACTIVATIONS: dict[str, Callable[[Tensor], Tensor]] = {
     "relu": torch.nn.functional.relu,
     "silu": torch.nn.functional.silu,
@@ -198,12 +191,10 @@ class DifferentiableTrajectory:
 def _trajectory_model(model: Any) -> TrajectoryRegressor:
     """The trajectory model that predicts the means of `model`, if all of it has a derivative."""
     check_is_fitted(model)
-    inner, within = None, model
+    inner = model
     # what leaves the means as they are; a Pipeline may not
-    while inner is not within:
+    while not isinstance(inner, Pipeline) and (within := inside(inner)) is not None:
         inner = within
-        name = next((name for kind, name in _INSIDE.items() if isinstance(inner, kind)), None)
-        within = getattr(inner, name or "best_estimator_", inner)
     if not isinstance(inner, TrajectoryRegressor):
         raise _no_derivative(f"{type(inner).__name__} is no TrajectoryRegressor")
     if not isinstance(inner.estimator_, MLPEnsembleRegressor):
@@ -230,13 +221,7 @@ def _affine_inputs(model: TrajectoryRegressor) -> tuple[NDArray[np.intp], Floats
     for of_part, transformer in model.scaler_.parts_:
         if own in of_part:
             continue
-        width = len(of_part)
-        # columns that did not vary are divided by their magnitude
-        found: tuple[Floats, Floats] | None
-        if transformer is None:
-            found = 1 / model.scaler_.magnitude_[of_part], np.zeros(width)
-        else:
-            found = _affine(transformer, width)
+        found = model.scaler_.affine_part(of_part, transformer)
         if found is None:
             raise _no_derivative(
                 f"its scaler has a {type(transformer).__name__}, which is not linear"

@@ -2,12 +2,11 @@
 
 import warnings
 from collections.abc import Iterator
-from dataclasses import replace
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from sklearn.base import clone
 from sklearn.frozen import FrozenEstimator
 from sklearn.model_selection import GroupKFold, GroupShuffleSplit, check_cv
@@ -19,26 +18,10 @@ from trajlearn.dynamics.forecast import Forecast
 from trajlearn.exceptions import CalibrationWarning, NoUncertaintyError
 from trajlearn.trajectories import TrajectoryDataset
 
-__all__ = ["fit_and_forecast", "in_groups", "residuals_of", "splits"]
+__all__ = ["fit_and_forecast", "residuals_of", "splits"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
-
-
-def in_groups(ds: TrajectoryDataset, groups: ArrayLike | None) -> TrajectoryDataset:
-    """The episodes with `groups`, if they are given, as their group.
-
-    Raises
-    ------
-    ValueError
-        If there is not one label an episode.
-    """
-    if groups is None:
-        return ds
-    labels = np.asarray(groups)
-    if labels.shape != (len(ds),):
-        raise ValueError(f"groups has shape {labels.shape}; give one label an episode ({len(ds)}).")
-    return TrajectoryDataset._of(replace(ds._columns, group=labels), ds._names)
 
 
 def _is_share(cv: Any) -> bool:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from trajlearn.exceptions import DivergenceWarning, HorizonWarning, SmoothingWarning
 from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories._columns import runs
+from trajlearn.trajectories.times import episode_steps
 
 __all__ = ["begun", "imagine", "together"]
 
@@ -50,21 +51,34 @@ def begun(
     return TrajectoryDataset._of(columns.freeze(), _without_controls(ds)._names)
 
 
-def imagine(teacher: Any, ds: TrajectoryDataset, n_steps: int, limits: Floats) -> TrajectoryDataset:
+def imagine(
+    teacher: Any,
+    ds: TrajectoryDataset,
+    n_steps: int,
+    limits: Floats,
+    rng: np.random.Generator,
+) -> TrajectoryDataset:
     """What a fitted model expects of `n_steps` of episodes that have begun.
 
     States are clipped to the `limits` (2, d_s): beyond them, far off is all that is known, and an
-    episode that ended there would say nothing of its end.
+    episode that ended there would say nothing of its end. Nobody knows references after the log,
+    nor when the next step is where steps vary; such episodes are not longer than the logged ones.
     """
+    within_log = ds.references is not None or bool(np.isnan(episode_steps(ds)).any())
+    reaches_beyond = n_steps > ds.lengths.min()
     with warnings.catch_warnings():
         # what diverges is clipped, and nothing is compared with these forecasts
         for category in (DivergenceWarning, HorizonWarning, SmoothingWarning):
             warnings.simplefilter("ignore", category)
-        forecast = teacher.predict(ds, horizon=n_steps, actions="policy")
-    # the log ends where its references do
-    longest = n_steps if ds.references is None else ds.lengths
-    steps = np.minimum(forecast.lengths, longest)
-    states = np.concatenate([forecast.initial_states[:, None], forecast.mean], axis=1)
+        forecast = teacher.predict(
+            ds,
+            horizon=None if within_log and reaches_beyond else n_steps,
+            actions="policy",
+            random_state=int(rng.integers(2**31)),
+        )
+    steps = np.minimum(forecast.lengths, n_steps)
+    known = _columns_of(ds.state_names, forecast.state_names, type(teacher).__name__)
+    states = np.concatenate([forecast.initial_states[:, None], forecast.mean], axis=1)[..., known]
     times = np.concatenate([forecast.initial_times[:, None], forecast.times], axis=1)
     columns = ds._columns
     references = columns.references
@@ -79,6 +93,19 @@ def imagine(teacher: Any, ds: TrajectoryDataset, n_steps: int, limits: Floats) -
         references=references,
     )
     return TrajectoryDataset._of(imagined.freeze(), ds._names)
+
+
+def _columns_of(names: tuple[str, ...], predicted: tuple[str, ...], teacher: str) -> list[int]:
+    """Where the logged states are among those predicted, to which a smoother appends some."""
+    if len(predicted) == len(names) and not set(predicted) & set(names):
+        # a model that was fitted elsewhere, under other names
+        return list(range(len(names)))
+    if missing := [name for name in names if name not in predicted]:
+        raise ValueError(
+            f"the teacher ({teacher}) predicts the states {list(predicted)}, and an imagined "
+            f"episode needs {missing}, too: let it predict all logged states."
+        )
+    return [predicted.index(name) for name in names]
 
 
 def _within(states: Floats, limits: Floats) -> Floats:

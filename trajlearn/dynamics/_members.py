@@ -7,11 +7,10 @@ from sklearn.frozen import FrozenEstimator
 from sklearn.pipeline import Pipeline
 
 from trajlearn.dynamics._learner import n_members_of
-from trajlearn.dynamics.calibrated import CalibratedForecaster
-from trajlearn.dynamics.distilled import DistilledForecaster
+from trajlearn.dynamics._meta import ForecasterAround
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 
-__all__ = ["member_of", "n_members", "unwrapped"]
+__all__ = ["inside", "member_of", "n_members", "unwrapped"]
 
 # what a fitted ensemble has of each member: lists of arrays (E, ...), and one array (2, E, ...)
 _BY_LAYER = ("coefs_", "intercepts_", "variance_coefs_", "variance_intercepts_")
@@ -19,7 +18,7 @@ _BY_LAYER = ("coefs_", "intercepts_", "variance_coefs_", "variance_intercepts_")
 
 def unwrapped(model: Any) -> Any:
     """What predicts, inside a search over settings, a pipeline, a calibration or a distillation."""
-    while (inner := _inside(model)) is not None:
+    while (inner := inside(model)) is not None:
         model = inner
     return model
 
@@ -58,21 +57,19 @@ def member_of(model: Any, i: int) -> Any:
     return _with_member(model, i)
 
 
-def _inside(model: Any) -> Any:
+def inside(model: Any) -> Any:
     """The model that one leaves its predictions to, or None."""
     if isinstance(model, Pipeline):
         return model[-1]
     if isinstance(model, FrozenEstimator):
         return model.estimator
-    if isinstance(model, CalibratedForecaster):
-        return getattr(model, "estimator_", None)
-    if isinstance(model, DistilledForecaster):
-        return getattr(model, "student_", None)
+    if isinstance(model, ForecasterAround):
+        return model._forecaster
     return getattr(model, "best_estimator_", None)
 
 
 def _with_member(model: Any, i: int) -> Any:
-    inner = _inside(model)
+    inner = inside(model)
     if inner is not None:
         one = _with_member(inner, i)
         if not isinstance(model, Pipeline):

@@ -6,15 +6,14 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.utils import Tags
 
-from trajlearn._persistence import SaveMixin
 from trajlearn._sklearn import fit_context
-from trajlearn.dynamics._forecaster import Forecaster, Prediction, Request
+from trajlearn.dynamics._episodes_only import EpisodesOnly
+from trajlearn.dynamics._forecaster import Prediction, Request
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.exceptions import MissingFieldError, NoUncertaintyError
-from trajlearn.trajectories import TrajectoryDataset, as_dataset
+from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories._signals import interpolate
 from trajlearn.trajectories.times import time_steps
 
@@ -24,15 +23,10 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
 
-class EpisodeForecaster(SaveMixin, Forecaster):
-    """Forecaster of episodes alone: plain rows mean nothing to it."""
+class EpisodeForecaster(EpisodesOnly):
+    """Forecaster of episodes by what all of them have in common, or by nothing."""
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {}
-
-    def __sklearn_tags__(self) -> Tags:
-        tags = super().__sklearn_tags__()
-        tags.input_tags.two_d_array = False
-        return tags
 
     @property
     def learns(self) -> bool:
@@ -55,9 +49,7 @@ class EpisodeForecaster(SaveMixin, Forecaster):
         -------
         self
         """
-        if y is not None:
-            raise ValueError("y must be omitted: the targets come from the episodes themselves.")
-        ds = as_dataset(X)
+        ds = self._episodes(X, y)
         self._learn_ranges_of(ds)
         self._learn(ds)
         return self
@@ -78,21 +70,6 @@ class EpisodeForecaster(SaveMixin, Forecaster):
         Forecast
         """
         return self.forecast(X, return_std=return_std, **settings)
-
-    def score(self, X: Any, y: None = None, sample_weight: Any = None) -> float:
-        """Minus the range-normalised squared error, averaged over horizon and episodes.
-
-        Parameters
-        ----------
-        X : TrajectoryDataset or list of Trajectory
-        y : None
-        sample_weight : array-like of shape (n,), optional
-
-        Returns
-        -------
-        float
-        """
-        return self._score_episodes(X, sample_weight)
 
     def _learn(self, ds: TrajectoryDataset) -> None:
         """Learn from episodes; nothing by default."""

@@ -1,18 +1,16 @@
 """Forecasts whose uncertainty was checked against held-out episodes, and corrected."""
 
 import warnings
-from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.frozen import FrozenEstimator
-from sklearn.utils import Tags, check_random_state
+from sklearn.utils import check_random_state
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted
 
-from trajlearn._persistence import SaveMixin
 from trajlearn._sklearn import HasMethods, Interval, StrOptions, fit_context
 from trajlearn.dynamics._calibration import Residuals, crps_rescaling
 from trajlearn.dynamics._conformal import (
@@ -21,15 +19,15 @@ from trajlearn.dynamics._conformal import (
     simultaneous_bands,
     steps_of,
 )
-from trajlearn.dynamics._forecaster import Forecaster
-from trajlearn.dynamics._held_out import fit_and_forecast, in_groups, residuals_of
-from trajlearn.dynamics._nested_defaults import NestedDefaults
+from trajlearn.dynamics._episode_arguments import in_groups
+from trajlearn.dynamics._held_out import fit_and_forecast, residuals_of
+from trajlearn.dynamics._meta import ForecasterAround, forecaster_can
 from trajlearn.dynamics._residual_paths import ResidualPaths, residual_paths
 from trajlearn.dynamics._shared_states import shared_states
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.dynamics.trajectory import TrajectoryRegressor
 from trajlearn.exceptions import CalibrationWarning, HorizonWarning
-from trajlearn.trajectories import TrajectoryDataset, as_dataset, is_episodes
+from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories._relabeler import generator
 
 __all__ = ["CalibratedForecaster"]
@@ -41,15 +39,7 @@ Ints = NDArray[np.intp]
 _LEAST_STD = 1e-9
 
 
-def _wrapped_has(name: str) -> Callable[[Any], bool]:
-    def check(self: Any) -> bool:
-        inner = getattr(self, "estimator_", None)
-        return hasattr(inner if inner is not None else self._given(), name)
-
-    return check
-
-
-class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
+class CalibratedForecaster(ForecasterAround):
     """Recalibrates the uncertainty of any dynamics estimator on held-out episodes.
 
     Predicted means stay as they are. What changes is what is said about their errors:
@@ -148,6 +138,7 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
 
     bands_: ConformalBands | None
 
+    _forecasts_by = "estimator"
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "estimator": [HasMethods(["fit", "predict"]), None],
         "method": [StrOptions({"conformal", "variance"})],
@@ -177,17 +168,12 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
         self.error_score = error_score
         self.random_state = random_state
 
-    def __sklearn_tags__(self) -> Tags:
-        tags = super().__sklearn_tags__()
-        tags.input_tags.two_d_array = False
-        return tags
-
     def _defaults(self) -> dict[str, Any]:
         return {"estimator": TrajectoryRegressor()}
 
-    def _given(self) -> Any:
-        # not `or`: some estimators have a length, and an unfitted one has none
-        return self._defaults()["estimator"] if self.estimator is None else self.estimator
+    def __sklearn_is_fitted__(self) -> bool:
+        # what is set last: an estimator without its calibration does not count
+        return hasattr(self, "bands_")
 
     # -- fitting --------------------------------------------------------------------------
 
@@ -220,16 +206,14 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
         ValueError
             If there are too few episodes or groups, or a splitter holds one out twice.
         """
-        if y is not None:
-            raise ValueError("y must be omitted: the targets come from the episodes themselves.")
-        ds = in_groups(_episodes(X), groups)
+        ds = in_groups(self._episodes(X, y), groups)
         # if this fit fails, the calibration of an earlier one must not be taken for its own
         if hasattr(self, "bands_"):
             del self.bands_
         seed = check_random_state(self.random_state).randint(2**31, size=4)
         rng = np.random.default_rng(seed)
         self.estimator_, forecast, truth = fit_and_forecast(
-            self._given(), ds, cv=self.cv, start=self.start, rng=rng
+            self._given()["estimator"], ds, cv=self.cv, start=self.start, rng=rng
         )
         self.calibration_ids_ = truth.ids
         self.has_std_ = forecast.std is not None
@@ -286,12 +270,9 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
         X: Any,
         return_std: bool = False,
         *,
-        start: ArrayLike = 0,
-        horizon: int | None = None,
-        actions: str = "auto",
-        policy: Any = None,
         n_samples: int | None = None,
         random_state: Any = None,
+        **settings: Any,
     ) -> Forecast:
         """Forecast episodes.
 
@@ -300,11 +281,11 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
         X : TrajectoryDataset or list of Trajectory
         return_std : bool, default=False
             Also give `std`, and `bands` if the method is "conformal".
-        start, horizon, actions, policy
-            As in `forecast` of the estimator.
         n_samples : int or None, default=None
             Also draw that many whole trajectories; `std` and `bands` come with them.
         random_state : int, RandomState or None, default=None
+        **settings
+            Start, horizon, actions and policy, as in `forecast` of the estimator.
 
         Returns
         -------
@@ -317,36 +298,13 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
         CalibrationWarning
             If actions come from elsewhere than in calibration.
         """
-        check_is_fitted(self, "bands_")
+        check_is_fitted(self)
         uncertain = return_std or bool(n_samples)
-        found = self.estimator_.predict(
-            _episodes(X),
-            return_std=uncertain and self.has_std_,
-            start=start,
-            horizon=horizon,
-            actions=actions,
-            policy=policy,
-            random_state=random_state,
-        )
-        raw = found._replace(state_range=self.state_range_)
+        asked = uncertain and self.has_std_
+        raw = super().predict(X, asked, random_state=random_state, **settings)
         return self._calibrated(raw, n_samples, random_state) if uncertain else raw
 
-    def forecast(self, X: Any, **settings: Any) -> Forecast:
-        """Forecast episodes: the same as `predict`.
-
-        Parameters
-        ----------
-        X : TrajectoryDataset or list of Trajectory
-        **settings
-            As in `predict`.
-
-        Returns
-        -------
-        Forecast
-        """
-        return self.predict(X, **settings)
-
-    @available_if(_wrapped_has("predict_trajectory"))
+    @available_if(forecaster_can("predict_trajectory"))
     def predict_trajectory(
         self,
         initial_states: ArrayLike,
@@ -373,36 +331,16 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
         -------
         Forecast
         """
-        check_is_fitted(self, "bands_")
+        check_is_fitted(self)
         uncertain = return_std or bool(n_samples)
-        found = self.estimator_.predict_trajectory(
+        raw = super().predict_trajectory(
             initial_states,
             horizons=horizons,
             return_std=uncertain and self.has_std_,
             random_state=random_state,
             **signals,
         )
-        raw = found._replace(state_range=self.state_range_)
         return self._calibrated(raw, n_samples, random_state) if uncertain else raw
-
-    def score(self, X: Any, y: None = None, sample_weight: Any = None) -> float:
-        """Minus the range-normalised squared error, averaged over horizon and episodes.
-
-        Parameters
-        ----------
-        X : TrajectoryDataset or list of Trajectory
-        y : None
-        sample_weight : array-like of shape (n,), optional
-
-        Returns
-        -------
-        float
-        """
-        return self._score_episodes(_episodes(X), sample_weight)
-
-    def _ends_with_log(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
-        inner = getattr(self.estimator_, "_ends_with_log", None)
-        return inner is not None and inner(ds, actions, policy)
 
     def _calibrated(self, raw: Forecast, n_samples: int | None, random_state: Any) -> Forecast:
         """A forecast of the estimator with rescaled std, samples and bands."""
@@ -436,14 +374,3 @@ class CalibratedForecaster(SaveMixin, NestedDefaults, Forecaster):
                 HorizonWarning,
                 stacklevel=4,
             )
-
-
-def _episodes(X: Any) -> TrajectoryDataset:
-    if isinstance(X, (list, tuple)) and not len(X):
-        raise ValueError("X is empty: give at least one episode.")
-    if not is_episodes(X):
-        raise TypeError(
-            f"CalibratedForecaster calibrates by whole episodes, and got {type(X).__name__}: give "
-            "a TrajectoryDataset or a list of Trajectory, not rows."
-        )
-    return as_dataset(X)

@@ -6,20 +6,19 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.utils import Tags, check_random_state
+from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
-from trajlearn._persistence import SaveMixin
 from trajlearn._sklearn import HasMethods, Interval, fit_context
-from trajlearn.dynamics._forecaster import Forecaster
-from trajlearn.dynamics._held_out import in_groups
+from trajlearn.dynamics._episode_arguments import checked_weight, in_groups, weights_for
 from trajlearn.dynamics._imagination import begun, imagine, together
 from trajlearn.dynamics._learner import seeded
-from trajlearn.dynamics._nested_defaults import NestedDefaults
+from trajlearn.dynamics._meta import ForecasterAround
+from trajlearn.dynamics._shared_states import shared_states
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.dynamics.one_step import OneStepRegressor
 from trajlearn.dynamics.trajectory import TrajectoryRegressor
-from trajlearn.trajectories import TrajectoryDataset, as_dataset, is_episodes
+from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories.times import median_step
 
 if TYPE_CHECKING:
@@ -30,7 +29,7 @@ __all__ = ["DistilledForecaster"]
 Floats = NDArray[np.float64]
 
 
-class DistilledForecaster(SaveMixin, NestedDefaults, Forecaster):
+class DistilledForecaster(ForecasterAround):
     """A trajectory model that learns from logged episodes and from a one-step model's.
 
     How the future depends on theta, a trajectory model learns from many theta; a log of a few
@@ -58,7 +57,8 @@ class DistilledForecaster(SaveMixin, NestedDefaults, Forecaster):
     n_imagined : int, default=1000
         Imagined episodes: they are cheap, and each has a theta of its own.
     horizon : int or None, default=None
-        Their steps; None is the longest logged episode. References end with the log.
+        Their steps; None is the longest logged episode. Those that begin as an episode with
+        references, or where the time step varies, end as it does.
     reach : float, default=3.0
         Imagined states are clipped to this multiple of the logged range about its centre (of the
         range with `initial_states`): that a theta leads far off matters, not how far. Were the
@@ -129,6 +129,7 @@ class DistilledForecaster(SaveMixin, NestedDefaults, Forecaster):
     imagined_: TrajectoryDataset
     dt_: float | None
 
+    _forecasts_by = "student"
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
         "teacher": [HasMethods(["fit", "predict"]), None],
         "student": [HasMethods(["fit", "predict"]), None],
@@ -166,11 +167,6 @@ class DistilledForecaster(SaveMixin, NestedDefaults, Forecaster):
         self.weight_logged = weight_logged
         self.error_score = error_score
         self.random_state = random_state
-
-    def __sklearn_tags__(self) -> Tags:
-        tags = super().__sklearn_tags__()
-        tags.input_tags.two_d_array = False
-        return tags
 
     def _defaults(self) -> dict[str, Any]:
         return {"teacher": OneStepRegressor(clip_states=3.0), "student": TrajectoryRegressor()}
@@ -214,35 +210,29 @@ class DistilledForecaster(SaveMixin, NestedDefaults, Forecaster):
             If the teacher has no policy and needs one; if `param_bounds` or `initial_states` do
             not fit the episodes.
         """
-        if y is not None:
-            raise ValueError("y must be omitted: the targets come from the episodes themselves.")
-        ds = in_groups(_episodes(X), groups)
+        ds = in_groups(self._episodes(X, y), groups)
         ds.require("params", by="DistilledForecaster (theta is what it varies)")
-        weight = _checked_weight(sample_weight, len(ds))
-        if not weight.all():
+        weight = np.ones(len(ds))
+        if sample_weight is not None:
+            weight = checked_weight(sample_weight, len(ds))
             ds, weight = ds[weight > 0], weight[weight > 0]
         given = self._given()
         _require_policy(given["teacher"])
+        bounds = self._bounds(ds)
         seed = check_random_state(self.random_state).randint(2**31, size=4)
         # streams of their own: what is imagined does not depend on what the teacher has to seed
         teaching, imagining, learning = np.random.default_rng(seed).spawn(3)
+        teacher = _fitted(given["teacher"], ds, weight, teaching)
+        imagined = self._imagined(teacher, ds, weight, bounds, imagining)
+        both = together(ds, imagined)
+        counts = np.concatenate([self.weight_logged * weight, np.ones(len(imagined))])
+        student = _fitted(given["student"], both, counts, learning)
+        # all at once: if this fit fails, no teacher stands beside the student of an earlier one
+        self.teacher_, self.student_, self.imagined_ = teacher, student, imagined
+        self.param_bounds_, self.dt_ = bounds, median_step(ds)
         self._learn_ranges_of(ds)
-        self.param_bounds_ = self._bounds(ds)
-        self.teacher_ = _fitted(given["teacher"], ds, weight, teaching)
-        self.imagined_ = self._imagined(ds, weight, imagining)
-        both = together(ds, self.imagined_)
-        counts = np.concatenate([self.weight_logged * weight, np.ones(len(self.imagined_))])
-        self.student_ = _fitted(given["student"], both, counts, learning)
-        self.dt_ = median_step(ds)
-        self.max_horizon_ = getattr(self.student_, "max_horizon_", np.inf)
+        self.max_horizon_ = getattr(student, "max_horizon_", np.inf)
         return self
-
-    def _given(self) -> dict[str, Any]:
-        # not `or`: some estimators have a length, and an unfitted one has none
-        return {
-            name: default if getattr(self, name) is None else getattr(self, name)
-            for name, default in self._defaults().items()
-        }
 
     def _bounds(self, ds: TrajectoryDataset) -> Floats:
         theta = ds._columns.params
@@ -263,9 +253,14 @@ class DistilledForecaster(SaveMixin, NestedDefaults, Forecaster):
         return bounds
 
     def _imagined(
-        self, ds: TrajectoryDataset, weight: Floats, rng: np.random.Generator
+        self,
+        teacher: Any,
+        ds: TrajectoryDataset,
+        weight: Floats,
+        bounds: Floats,
+        rng: np.random.Generator,
     ) -> TrajectoryDataset:
-        lower, upper = self.param_bounds_.T
+        lower, upper = bounds.T
         episode = rng.choice(len(ds), self.n_imagined, p=weight / weight.sum())
         theta = lower + (upper - lower) * rng.random((self.n_imagined, len(lower)))
         starts = None
@@ -283,78 +278,9 @@ class DistilledForecaster(SaveMixin, NestedDefaults, Forecaster):
         middle = (low + high) / 2
         n_steps = int(ds.lengths.max()) if self.horizon is None else self.horizon
         limits = np.stack([middle - half, middle + half])
-        return imagine(self.teacher_, begun(ds, episode, theta, starts), n_steps, limits)
+        return imagine(teacher, begun(ds, episode, theta, starts), n_steps, limits, rng)
 
     # -- prediction -----------------------------------------------------------------------
-
-    def predict(self, X: Any, return_std: bool = False, **settings: Any) -> Forecast:
-        """Forecast episodes by the student.
-
-        Parameters
-        ----------
-        X : TrajectoryDataset or list of Trajectory
-        return_std : bool, default=False
-        **settings
-            As in `forecast` of the student.
-
-        Returns
-        -------
-        Forecast
-        """
-        check_is_fitted(self, "student_")
-        found = self.student_.predict(_episodes(X), return_std=return_std, **settings)
-        return found._replace(state_range=self.state_range_)
-
-    def forecast(self, X: Any, **settings: Any) -> Forecast:
-        """Forecast episodes: the same as `predict`.
-
-        Parameters
-        ----------
-        X : TrajectoryDataset or list of Trajectory
-        **settings
-            As in `predict`.
-
-        Returns
-        -------
-        Forecast
-        """
-        return self.predict(X, **settings)
-
-    def predict_trajectory(
-        self, initial_states: ArrayLike, *, horizons: ArrayLike, **settings: Any
-    ) -> Forecast:
-        """Predict from states and known signals alone, without a dataset: for planning.
-
-        Parameters
-        ----------
-        initial_states : array-like of shape (n, d_s) or (d_s,)
-        horizons : array-like of shape (H,)
-            Times after the start.
-        **settings
-            As in `predict_trajectory` of the student.
-
-        Returns
-        -------
-        Forecast
-        """
-        check_is_fitted(self, "student_")
-        found = self.student_.predict_trajectory(initial_states, horizons=horizons, **settings)
-        return found._replace(state_range=self.state_range_)
-
-    def score(self, X: Any, y: None = None, sample_weight: Any = None) -> float:
-        """Minus the range-normalised squared error, averaged over horizon and episodes.
-
-        Parameters
-        ----------
-        X : TrajectoryDataset or list of Trajectory
-        y : None
-        sample_weight : array-like of shape (n,), optional
-
-        Returns
-        -------
-        float
-        """
-        return self._score_episodes(_episodes(X), sample_weight)
 
     def fidelity(self, X: Any, horizons: Sequence[int] | None = None) -> "pd.DataFrame":
         """What distilling cost: errors of the student and of the teacher, and between them.
@@ -370,52 +296,52 @@ class DistilledForecaster(SaveMixin, NestedDefaults, Forecaster):
         Returns
         -------
         DataFrame
-            One row a horizon: `horizon`; `n`, the episodes that reach it; `student` and
+            One row a horizon: `horizon`; `n`, the episodes in which both reach it; `student` and
             `teacher`, root mean squared errors in logged ranges, over states and episodes;
             `student_teacher`, the same of their difference. inf where one diverged.
         """
         import pandas as pd
 
-        check_is_fitted(self, "student_")
-        ds = _episodes(X)
+        check_is_fitted(self)
+        ds = self._episodes(X)
         student = self.predict(ds)
-        teacher = self.teacher_.predict(ds, actions="policy")
-        teacher = teacher._replace(state_range=self.state_range_)
-        longest = int(ds.lengths.max())
+        # the mean of particles, too, is to be the same each time
+        teacher = self._ranged(self.teacher_.predict(ds, actions="policy", random_state=0))
+        # a student that knows constant theta only ends where theta changes
+        lengths = np.minimum(student.lengths, teacher.lengths)
+        longest = int(lengths.max())
         steps = np.arange(1, longest + 1) if horizons is None else np.asarray(horizons)
         if steps.ndim != 1 or not len(steps) or steps.min() < 1 or steps.max() > longest:
-            raise ValueError(f"horizons must be steps from 1 to {longest}, the longest episode.")
-        low, high = self.state_range_
-        with np.errstate(invalid="ignore"):
-            apart = (student.mean - teacher.mean) / np.where(high > low, high - low, 1.0)
-        # both at infinity
-        apart[np.isinf(teacher.mean) | np.isinf(student.mean)] = np.inf
+            raise ValueError(
+                f"horizons must be steps from 1 to {longest}, the longest forecast of both."
+            )
+        reached = lengths[:, None] >= steps
         squared = {
             "student": student.squared_errors(ds),
             "teacher": teacher.squared_errors(ds),
-            "student_teacher": apart**2,
+            "student_teacher": self._squared_gap(student, teacher, ds),
         }
-        reached = (ds.lengths[:, None] >= steps).sum(axis=0)
         errors = {
-            name: np.sqrt(np.nanmean(values[:, steps - 1], axis=(0, 2)))
+            name: np.sqrt(np.nanmean(values[:, steps - 1], axis=(0, 2), where=reached[..., None]))
             for name, values in squared.items()
         }
-        return pd.DataFrame({"horizon": steps, "n": reached, **errors})
+        return pd.DataFrame({"horizon": steps, "n": reached.sum(axis=0), **errors})
 
-    def _ends_with_log(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
-        inner = getattr(self.student_, "_ends_with_log", None)
-        return inner is not None and inner(ds, actions, policy)
-
-
-def _episodes(X: Any) -> TrajectoryDataset:
-    if isinstance(X, (list, tuple)) and not len(X):
-        raise ValueError("X is empty: give at least one episode.")
-    if not is_episodes(X):
-        raise TypeError(
-            f"DistilledForecaster imagines whole episodes, and got {type(X).__name__}: give a "
-            "TrajectoryDataset or a list of Trajectory, not rows."
-        )
-    return as_dataset(X)
+    def _squared_gap(self, student: Forecast, teacher: Forecast, ds: TrajectoryDataset) -> Floats:
+        """Squared difference of two forecasts in logged ranges; inf where one diverged."""
+        of_student, names, _ = shared_states(student.state_names, ds)
+        of_teacher, others, _ = shared_states(teacher.state_names, ds)
+        both = [name for name in names if name in others]
+        columns = [of_student[names.index(name)] for name in both]
+        n_steps = min(student.mean.shape[1], teacher.mean.shape[1])
+        one = student.mean[:, :n_steps, columns]
+        other = teacher.mean[:, :n_steps, [of_teacher[others.index(name)] for name in both]]
+        low, high = student.state_range[:, columns]
+        with np.errstate(invalid="ignore"):
+            gap: Floats = ((one - other) / np.where(high > low, high - low, 1.0)) ** 2
+        # both at infinity
+        gap[np.isinf(one) | np.isinf(other)] = np.inf
+        return gap
 
 
 def _require_policy(teacher: Any) -> None:
@@ -424,8 +350,8 @@ def _require_policy(teacher: Any) -> None:
     if not hasattr(last, "policy") or last.policy is not None:
         return
     relabeler = getattr(last, "relabeler", None)
-    inputs = last.inputs if relabeler is None else relabeler.inputs
-    if inputs == "action" or (not isinstance(inputs, str) and "action" in inputs):
+    inputs = getattr(last if relabeler is None else relabeler, "inputs", "params")
+    if "action" in ((inputs,) if isinstance(inputs, str) else inputs):
         raise ValueError(
             "the teacher takes actions and has no policy, so it does not know what other theta "
             "would do: give DistilledForecaster(OneStepRegressor(policy=..., clip_states=3.0)) or "
@@ -434,22 +360,6 @@ def _require_policy(teacher: Any) -> None:
         )
 
 
-def _checked_weight(sample_weight: Any, n: int) -> Floats:
-    if sample_weight is None:
-        return np.ones(n)
-    weight = np.asarray(sample_weight, dtype=np.float64)
-    if weight.shape != (n,) or not np.isfinite(weight).all() or (weight < 0).any():
-        raise ValueError(
-            f"sample_weight needs one finite weight >= 0 an episode ({n}); got shape "
-            f"{weight.shape}."
-        )
-    if not weight.any():
-        raise ValueError("sample_weight is zero everywhere; give an episode some weight.")
-    return weight
-
-
 def _fitted(estimator: Any, ds: TrajectoryDataset, weight: Floats, rng: np.random.Generator) -> Any:
-    # not everything takes weights, and a factor on all says nothing
-    uneven = (weight != weight[0]).any()
     # a frozen one wants a y
-    return seeded(estimator, rng).fit(ds, None, **({"sample_weight": weight} if uneven else {}))
+    return seeded(estimator, rng).fit(ds, None, **weights_for(estimator, weight))

@@ -1,6 +1,6 @@
 """What a dynamics estimator predicts: trajectories with their uncertainty."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
 from trajlearn.dynamics._conformal import half_widths
+from trajlearn.dynamics._joined_forecasts import PER_FORECAST, joined
 from trajlearn.dynamics._shared_states import shared_states
 from trajlearn.trajectories import TrajectoryDataset
 
@@ -18,8 +19,7 @@ __all__ = ["Forecast", "shared_states"]
 
 Floats = NDArray[np.float64]
 
-_PER_FORECAST = ("times", "lengths", "initial_states", "initial_times", "start", "diverged_at")
-# the same, None where there is none
+# fields with one entry a forecast that are None where there is none
 _PERHAPS = ("std", "raw_std", "episode", "bands")
 
 
@@ -127,7 +127,7 @@ class Forecast:
         self, func: Callable[..., Any], types: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
     ) -> Any:
         if func is np.concatenate and len(args) == 1 and not kwargs.get("axis"):
-            return concatenate(list(args[0]))
+            return joined(list(args[0]))
         plain = {name: _without_forecasts(value) for name, value in kwargs.items()}
         return func(*_without_forecasts(args), **plain)
 
@@ -136,7 +136,7 @@ class Forecast:
             # scikit-learn indexes samples with (indices, ...)
             key = key[0]
         index = np.atleast_1d(np.arange(len(self))[key])
-        chosen: dict[str, Any] = {name: getattr(self, name)[index] for name in _PER_FORECAST}
+        chosen: dict[str, Any] = {name: getattr(self, name)[index] for name in PER_FORECAST}
         for name in _PERHAPS:
             value = getattr(self, name)
             chosen[name] = None if value is None else value[index]
@@ -387,52 +387,3 @@ def _without_forecasts(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return type(value)(_without_forecasts(item) for item in value)
     return np.asarray(value) if isinstance(value, Forecast) else value
-
-
-def concatenate(forecasts: Sequence[Forecast]) -> Forecast:
-    """Join forecasts episode after episode, padded to the longest horizon."""
-    longest = max(forecasts, key=lambda forecast: len(forecast.horizons))
-    n_horizons = len(longest.horizons)
-    if any(f.episode is not None for f in forecasts):
-        raise ValueError("forecasts with several starts an episode cannot be concatenated.")
-    if any(
-        f.actions != longest.actions or f.mean.shape[2] != longest.mean.shape[2] for f in forecasts
-    ):
-        raise ValueError(
-            "the forecasts differ in their states or in where their actions came from."
-        )
-    for f in forecasts:
-        if not np.array_equal(f.horizons, longest.horizons[: len(f.horizons)]):
-            raise ValueError("the forecasts have different horizons, so they cannot be joined.")
-
-    def joined(name: str, axis: int = 0) -> Floats | None:
-        values = [getattr(forecast, name) for forecast in forecasts]
-        if any(value is None for value in values):
-            return None
-        padded = []
-        for value in values:
-            width = [(0, 0)] * value.ndim
-            width[axis + 1] = (0, n_horizons - value.shape[axis + 1])
-            padded.append(np.pad(value, width, constant_values=np.nan))
-        return np.concatenate(padded, axis=axis)
-
-    rest = {
-        name: np.concatenate([getattr(forecast, name) for forecast in forecasts])
-        for name in _PER_FORECAST
-        if name != "times"
-    }
-    bands = [f.bands for f in forecasts if f.bands is not None]
-    if bands and len(bands) < len(forecasts):
-        raise ValueError("some of the forecasts have conformal bands and others have none.")
-    low = np.min([f.state_range[0] for f in forecasts], axis=0)
-    high = np.max([f.state_range[1] for f in forecasts], axis=0)
-    return longest._replace(
-        mean=joined("mean"),
-        std=joined("std"),
-        raw_std=joined("raw_std"),
-        samples=joined("samples", axis=1),
-        times=joined("times"),
-        state_range=np.stack([low, high]),
-        bands=np.concatenate(bands) if bands else None,
-        **rest,
-    )

@@ -8,11 +8,14 @@ from numpy.typing import NDArray
 
 from trajlearn._sklearn import HasMethods, Interval, StrOptions
 from trajlearn.dynamics._base import TwoDoorRegressor
+from trajlearn.dynamics._correlated_noise import correlated_noise, correlation_time
 from trajlearn.dynamics._dynamics import DynamicsEstimator
 from trajlearn.dynamics._forecaster import Prediction, Request
 from trajlearn.dynamics._learner import mixture, required, spread, takes_weights
 from trajlearn.dynamics._query import Query, make_query
-from trajlearn.dynamics.scaling import BlockScaler, HorizonFeatures, PhaseFeatures
+from trajlearn.dynamics.horizon import HorizonFeatures
+from trajlearn.dynamics.phase import PhaseFeatures
+from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.regressors._prediction import mean_of_members
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 from trajlearn.trajectories import SubtrajectoryRelabeler, TrajectoryDataset
@@ -281,11 +284,7 @@ class TrajectoryRegressor(DynamicsEstimator):
             # some learners claim to be certain
             floor = np.maximum(1e-6 * (residual**2).mean(axis=(0, 1)), 1e-300)
             residual = residual / np.sqrt(np.maximum(variance, floor))
-        now, then = residual[:, :-1], residual[:, 1:]
-        power = np.sqrt((now**2).sum(axis=(0, 1)) * (then**2).sum(axis=(0, 1)))
-        correlation = (now * then).sum(axis=(0, 1)) / np.where(power > 0, power, 1.0)
-        step = median_step(few)
-        self.noise_time_ = -step / np.log(np.clip(correlation, 1e-6, 1 - 1e-6))
+        self.noise_time_ = correlation_time(residual, median_step(few))
 
     # -- forecasting ----------------------------------------------------------------------
 
@@ -405,12 +404,7 @@ class TrajectoryRegressor(DynamicsEstimator):
     ) -> Floats:
         """Whole trajectories: one member and one correlated noise path each."""
         member = rng.permutation(np.arange(n_samples) % len(means))
-        shape = (n_samples, *means.shape[1:])
-        noise = rng.standard_normal(shape)
         times = np.concatenate([query.initial_times[:, None], query.times], axis=1)
-        step = np.nan_to_num(np.diff(times, axis=1), nan=0.0)[..., None]
-        keep = np.exp(-step / self.noise_time_)
-        for k in range(1, shape[2]):
-            fresh = np.sqrt(1 - keep[:, k] ** 2) * noise[:, :, k]
-            noise[:, :, k] = keep[:, k] * noise[:, :, k - 1] + fresh
+        step = np.nan_to_num(np.diff(times, axis=1), nan=0.0)
+        noise = correlated_noise(rng, n_samples, step, self.noise_time_)
         return means[member] + np.sqrt(variances[member]) * noise

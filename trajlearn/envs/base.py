@@ -1,16 +1,16 @@
-"""What all simulated systems share: seeded episodes, batched roll-outs, early ends."""
+"""What all simulated systems share: seeded episodes, given flights, checks."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from itertools import pairwise
 from numbers import Integral
-from typing import ClassVar, NamedTuple, Protocol
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.random import Generator, RandomState
 from numpy.typing import ArrayLike, NDArray
 from sklearn.utils import check_random_state
 
+from trajlearn.envs._flight import Episode, Simulator, fly, fly_parallel
 from trajlearn.policies import Policy
 from trajlearn.trajectories import TrajectoryDataset
 
@@ -27,37 +27,6 @@ class _Streams(NamedTuple):
     def fresh_noise(self) -> Generator:
         """The noise of the next flight, whatever the flights before have used up."""
         return self.noise.spawn(1)[0]
-
-
-class _Episode(NamedTuple):
-    states: NDArray[np.float64]
-    actions: NDArray[np.float64]
-    params: NDArray[np.float64]
-    terminated: bool
-
-
-class _Simulator(Protocol):
-    """What advances the episodes of one batch: see ``Environment._simulator``."""
-
-    def __call__(
-        self,
-        rows: NDArray[np.intp],
-        states: NDArray[np.float64],
-        actions: NDArray[np.float64],
-        /,
-    ) -> NDArray[np.float64]: ...
-
-
-class _SimulationError(ValueError):
-    """A step that went wrong: in which row of the states, and how ("... left the bounds")."""
-
-    def __init__(self, row: int, reason: str) -> None:
-        super().__init__(row, reason)
-        self.row = row
-        self.reason = reason
-
-    def __str__(self) -> str:
-        return f"the simulation of row {self.row} of the states {self.reason}."
 
 
 class Environment(ABC):
@@ -120,11 +89,11 @@ class Environment(ABC):
     ) -> NDArray[np.float64]:
         """Advance checked states (n, d_s) by one step under clipped actions (n, d_a)."""
 
-    def _simulator(self, starts: NDArray[np.float64]) -> _Simulator:
+    def _simulator(self, starts: NDArray[np.float64]) -> Simulator:
         """Start episodes from ``starts`` and return what advances them.
 
         ``advance(rows, states, actions)`` gives the next states of the episodes ``rows``, which
-        are in ``states`` now; it may raise ``_SimulationError``. A system whose simulator knows
+        are in ``states`` now; it may raise ``SimulationError``. A system whose simulator knows
         more than the state (an angle beyond a turn, a solver's warm start) keeps it there.
         """
         return lambda rows, states, actions: self._step(states, actions)
@@ -250,13 +219,13 @@ class Environment(ABC):
         length = _positive_integer(length, "length")
         streams = self._episode_streams(n_episodes, random_state)
         policy = self.policy
-        kept: dict[int, _Episode] = {}
+        kept: dict[int, Episode] = {}
         pending = list(range(len(streams)))
         for _ in range(self.max_draws):
             starts = np.stack([self._draw_initial_state(streams[i].state) for i in pending])
             params = np.stack([self._draw_params(streams[i].params) for i in pending])
             noise = [streams[i].fresh_noise() for i in pending]
-            episodes = self._fly_parallel(starts, params, length, policy, pending, noise, n_jobs)
+            episodes = fly_parallel(self, starts, params, length, policy, pending, noise, n_jobs)
             for i, episode in zip(pending, episodes, strict=True):
                 if not (self.redraw_terminated and episode.terminated):
                     kept[i] = episode
@@ -340,88 +309,10 @@ class Environment(ABC):
         noise = [stream.fresh_noise() for stream in streams]
         numbers = range(len(starts))
         return self._dataset(
-            self._fly(starts, theta, length, policy or self.policy, numbers, noise)
+            fly(self, starts, theta, length, policy or self.policy, numbers, noise)
         )
 
-    def _fly_parallel(
-        self,
-        starts: NDArray[np.float64],
-        params: NDArray[np.float64],
-        length: int,
-        policy: Policy,
-        numbers: Sequence[int],
-        noise: Sequence[Generator],
-        n_jobs: int | None,
-    ) -> list[_Episode]:
-        """Share the episodes among joblib's workers, a stretch each."""
-        from joblib import Parallel, delayed, effective_n_jobs
-
-        n_workers = min(effective_n_jobs(n_jobs), len(starts))
-        if n_workers == 1:
-            return self._fly(starts, params, length, policy, numbers, noise)
-        edges = np.linspace(0, len(starts), n_workers + 1).astype(int).tolist()
-        shares = [slice(a, b) for a, b in pairwise(edges)]
-        parts = Parallel(n_jobs=n_jobs)(
-            delayed(self._fly)(
-                starts[part], params[part], length, policy, numbers[part], noise[part]
-            )
-            for part in shares
-        )
-        return [episode for part in parts for episode in part]
-
-    def _fly(
-        self,
-        starts: NDArray[np.float64],
-        params: NDArray[np.float64],
-        length: int,
-        policy: Policy,
-        numbers: Sequence[int],
-        noise: Sequence[Generator],
-    ) -> list[_Episode]:
-        """Step all episodes at once, dropping each from the batch when it ends.
-
-        ``numbers`` are the names of the episodes in messages, ``noise`` their generators.
-        """
-        n = len(starts)
-        states = np.empty((n, length + 1, len(self.state_names)))
-        actions = np.empty((n, length, len(self.action_names)))
-        lengths = np.full(n, length)
-        terminated = np.zeros(n, dtype=bool)
-        states[:, 0] = current = starts
-        flying, gains = np.arange(n), params
-        advance = self._simulator(starts)
-        for t in range(length):
-            times = np.full(len(flying), t * self.dt)
-            wanted = policy(current, gains, times)
-            applied = self._clipped(wanted, len(flying), f"the policy's actions at step {t}")
-            try:
-                current = advance(flying, current, applied)
-                current = self._disturbed(current, [noise[i] for i in flying.tolist()])
-                if not np.isfinite(current).all():
-                    row = int(np.argwhere(~np.isfinite(current))[0, 0])
-                    raise _SimulationError(row, "left the finite numbers")
-            except _SimulationError as error:
-                number, theta = numbers[flying[error.row]], gains[error.row].tolist()
-                raise ValueError(
-                    f"the simulation of episode {number} {error.reason} at step {t}: the step "
-                    f"dt={self.dt} is too long for the params {theta}, or the initial state is "
-                    "too large."
-                ) from error
-            actions[flying, t] = applied
-            states[flying, t + 1] = current
-            ended = self.is_terminal(current)
-            if ended.any():
-                lengths[flying[ended]] = t + 1
-                terminated[flying[ended]] = True
-                flying, current, gains = flying[~ended], current[~ended], gains[~ended]
-                if not len(flying):
-                    break
-        return [
-            _Episode(states[i, : steps + 1], actions[i, :steps], params[i], bool(terminated[i]))
-            for i, steps in enumerate(lengths)
-        ]
-
-    def _dataset(self, episodes: list[_Episode]) -> TrajectoryDataset:
+    def _dataset(self, episodes: list[Episode]) -> TrajectoryDataset:
         params = np.stack([episode.params for episode in episodes])
         own = params.shape[1] == len(self.param_names)
         return TrajectoryDataset.from_arrays(

@@ -7,7 +7,8 @@ import numpy as np
 from numpy.random import Generator
 from numpy.typing import ArrayLike, NDArray
 
-from trajlearn.envs.base import Environment, _SimulationError, _Simulator
+from trajlearn.envs._flight import SimulationError, Simulator
+from trajlearn.envs.base import Environment
 from trajlearn.policies import PID
 
 if TYPE_CHECKING:
@@ -248,7 +249,7 @@ class Reacher(Environment):
             angles[row], velocities[row] = arm.advance(actions[row], row)
         return _checked(angles, velocities)
 
-    def _simulator(self, starts: NDArray[np.float64]) -> _Simulator:
+    def _simulator(self, starts: NDArray[np.float64]) -> Simulator:
         model = self._model()
         arms = [_Arm(model) for _ in starts]
         for arm, angles, velocities in zip(arms, *_coordinates(starts), strict=True):
@@ -298,7 +299,7 @@ class _Arm:
 
             raised = [mjtWarning(i).name for i in np.flatnonzero(self._warnings)]
             names = ", ".join(name.removeprefix("mjWARN_") for name in raised)
-            raise _SimulationError(row, f"made MuJoCo warn ({names})")
+            raise SimulationError(row, f"made MuJoCo warn ({names})")
         return self._angles, self._velocities
 
 
@@ -327,5 +328,5 @@ def _checked(angles: NDArray[np.float64], velocities: NDArray[np.float64]) -> ND
     fast = ~(np.abs(velocities) <= MAX_SPEED).all(axis=1)
     if fast.any():
         reason = f"moved a joint faster than {MAX_SPEED:g} rad/s"
-        raise _SimulationError(int(np.argmax(fast)), reason)
+        raise SimulationError(int(np.argmax(fast)), reason)
     return _states(angles, velocities)

@@ -7,7 +7,6 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import Interval, StrOptions, fit_context
@@ -37,6 +36,7 @@ from trajlearn.trajectories._kalman_choices import (
 from trajlearn.trajectories._kalman_fit import Signals
 from trajlearn.trajectories._kalman_models import Kinematic, StateSpaceModel
 from trajlearn.trajectories._state_space import Grid, filtered, smoothed
+from trajlearn.trajectories._transformer import DatasetTransformer
 from trajlearn.trajectories.coerce import as_dataset
 from trajlearn.trajectories.dataset import TrajectoryDataset
 
@@ -45,8 +45,7 @@ __all__ = ["KalmanSmoother", "StateSpaceModel"]
 Floats = NDArray[np.float64]
 
 
-# A dataset is not to be wrapped in a DataFrame, whatever set_config(transform_output=) says.
-class KalmanSmoother(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None):  # type: ignore[call-arg]
+class KalmanSmoother(DatasetTransformer):
     """Estimate states from noisy measurements of them: a transformer from dataset to dataset.
 
     `fit_transform` smooths (Rauch, Tung and Striebel): every state is estimated from all of its

@@ -6,18 +6,17 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import fit_context
+from trajlearn.trajectories._transformer import DatasetTransformer
 from trajlearn.trajectories.coerce import as_dataset
 from trajlearn.trajectories.dataset import TrajectoryDataset
 
 __all__ = ["ParamsTransformer"]
 
 
-# A dataset is not to be wrapped in a DataFrame, whatever set_config(transform_output=) says.
-class ParamsTransformer(TransformerMixin, BaseEstimator, auto_wrap_output_keys=None):  # type: ignore[call-arg]
+class ParamsTransformer(DatasetTransformer):
     """Replace the control parameters of every episode by a function of them.
 
     A model that stands behind it in a `Pipeline` sees the new description, while episodes,
