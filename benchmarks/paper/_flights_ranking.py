@@ -41,7 +41,7 @@ def cell(split: str, fold: int, seed: int) -> dict[str, Any]:
     for window in WINDOWS:
         log_error = np.log(flown[window])
         known = train[np.isfinite(log_error[train])]
-        model = pooled_gp(seed).fit(_with_target(every.ds[known], log_error[known]))
+        model = pooled_gp(seed).fit(with_target(every.ds[known], log_error[known]))
         rows["direct GP"][window] = np.exp(model.predict(every.ds[test]))
         rows["nearest in time"][window] = np.array(
             [nearest(every, known, i, flown[window]) for i in test]
@@ -56,7 +56,7 @@ def pooled_gp(seed: int) -> DirectRewardGP:
     return model.set_params(scaler__params=gain_scaler())
 
 
-def _with_target(ds: TrajectoryDataset, target: Floats) -> TrajectoryDataset:
+def with_target(ds: TrajectoryDataset, target: Floats) -> TrajectoryDataset:
     """Flights whose logged reward is the target at every step: its mean over one step is, too."""
     return ds.assign(rewards=[np.full(n, y) for n, y in zip(ds.lengths, target, strict=True)])
 

@@ -89,13 +89,17 @@ def by_seed(table: pd.DataFrame, column: str) -> list[Floats]:
     return [some[column].to_numpy(dtype=np.float64) for _, some in ordered.groupby("seed")]
 
 
-def spread(values: ArrayLike) -> str:
-    """Median of a number over seeds, and its least and greatest value, as the tables print it."""
+def spread(values: ArrayLike, how: str | None = None) -> str:
+    """Median of a number over seeds, and its least and greatest value, as the tables print it.
+
+    `how` is a format such as ".2f"; None: two significant digits.
+    """
     some = np.asarray(values, dtype=np.float64)
-    middle = rounded(np.median(some))
-    if len(some) == 1:
-        return middle
-    return f"{middle} ({rounded(some.min())} to {rounded(some.max())})"
+    middle, low, high = (
+        rounded(value) if how is None else format(value, how)
+        for value in (np.median(some), some.min(), some.max())
+    )
+    return middle if len(some) == 1 else f"{middle} ({low} to {high})"
 
 
 def rounded(value: float, digits: int = 2) -> str:

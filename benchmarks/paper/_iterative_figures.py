@@ -50,7 +50,7 @@ def draw(tables: Tables) -> "dict[str, Figure]":
 
 
 def _curve(ax: "Axes", of: Result, method: str, column: str, i: int) -> None:
-    """Median by trial; the two methods of the paper with their percentiles."""
+    """Median by trial; of two methods the ranges of most repeats as well."""
     values = of.by_trial(method, column)
     style: dict[str, Any] = line_style(i)
     if method == RANDOM:

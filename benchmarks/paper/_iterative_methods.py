@@ -34,10 +34,12 @@ BO, RANDOM = "Bayesian optimisation", "random"
 BO_LATER, N_SOBOL = "Bayesian optimisation, 5 Sobol points first", 5
 #: What is compared, in the order in which it is shown, and what each learns from.
 METHODS = {
-    DISTILLED: "T, from the trials and from what a one-step model imagines; CMA-ES",
+    DISTILLED: "T, from the trials and from what a one-step model imagines; CMA-ES on the mean "
+    "return of sampled trajectories",
     GRADIENTS: "the same T; gradient ascent on the return of its mean trajectory",
     "T": "T, from the trials alone; CMA-ES",
-    "T, paper's settings": "the same, with the paper's network and scaling",
+    "T, paper's settings": "the same, with the paper's network and scaling, which give no "
+    "variance; CMA-ES on the return of its mean trajectory",
     "D": "one-step network, actions recomputed; CMA-ES",
     LINEAR: "one-step linear regression, actions recomputed; CMA-ES",
     "direct GP": "Gaussian process from (s_0, theta) to the return; CMA-ES on its mean",
@@ -149,9 +151,7 @@ def search(method: str, task: ControlTask, mode: str, repeat: int, planned: Floa
         **shared,
         initial_states=planned,
         optimizer="gradient" if by_gradients else "cma",
-        # with kappa = 0: the mean return of sampled trajectories, not the return of their mean
-        objective="lcb" if sampled else "mean",
-        kappa=0.0,
+        objective="expected" if sampled else "mean",
         n_samples=N_SAMPLES,
         n_evaluations=budget,
         is_terminal=task.is_terminal,
@@ -160,7 +160,7 @@ def search(method: str, task: ControlTask, mode: str, repeat: int, planned: Floa
 
 
 def proposal(search: Any, task: ControlTask, *, first: bool) -> tuple[Floats, float, float]:
-    """What to try next, and the seconds of fitting the model and of searching in it.
+    """What to try next, and the seconds of fitting the model (and asking it once) and of searching.
 
     Bayesian optimisation does both as one; all of it counts as searching.
     """

@@ -2,12 +2,11 @@
 
 from typing import NamedTuple
 
-import numpy as np
 import pandas as pd
 
 from benchmarks.paper._command import Tables
 from benchmarks.paper._control_tasks import normalised
-from benchmarks.paper._iterative_methods import BO
+from benchmarks.paper._iterative_methods import BO, BO_LATER, N_SOBOL
 
 #: Shares of the repeats between the percentiles that are shown, as in the paper's code.
 INNER, OUTER = 0.66, 0.95
@@ -18,6 +17,7 @@ NEAR = 0.95
 class Result(NamedTuple):
     """What a run found on one task.
 
+    `best` is that of the simulator's own search, or, `by_a_trial`, of a trial that is better;
     `trials` has the normalised columns `true` and `seen` of each trial, their best so far
     (`best_true`, `best_seen`), and `kept`: `true` of the theta with the best trial so far.
     """
@@ -25,6 +25,7 @@ class Result(NamedTuple):
     task: str
     trials: pd.DataFrame
     best: float
+    by_a_trial: bool
     floor: float
     scale: pd.Series
 
@@ -44,7 +45,8 @@ def result(tables: Tables) -> Result:
     [task] = [stem for stem in tables if not stem.endswith("-scale")]
     trials, scale = tables[task].copy(), tables[f"{task}-scale"].iloc[0]
     # never less than the best that any trial showed
-    best, floor = max(float(scale["test"]), float(trials["true"].max())), float(scale["floor"])
+    known, tried, floor = (float(v) for v in (scale["test"], trials["true"].max(), scale["floor"]))
+    best = max(known, tried)
     for column in ("true", "seen"):
         trials[column] = normalised(trials[column], floor, best)
     trials = trials.sort_values("trial", kind="stable")
@@ -55,7 +57,7 @@ def result(tables: Tables) -> Result:
     earlier = trials.groupby(["method", "repeat"], sort=False)["best_seen"].shift()
     trials["kept"] = trials["true"].where(~(trials["seen"] <= earlier))
     trials["kept"] = trials.groupby(["method", "repeat"], sort=False)["kept"].ffill()
-    return Result(task, trials.sort_index(), best, floor, scale)
+    return Result(task, trials.sort_index(), best, tried > known, floor, scale)
 
 
 def spread(values: pd.DataFrame, share: float) -> tuple[pd.Series, pd.Series]:
@@ -87,6 +89,10 @@ def median_behind(of: Result, method: str, column: str) -> pd.Series:
 
 
 def seconds(of: Result, method: str, column: str) -> float:
-    """Median time of a proposal that a model makes: not the first one, which is drawn."""
-    some = of.trials[(of.trials["method"] == method) & (of.trials["trial"] > 1)]
-    return float(np.median(some[column]))
+    """Median time of a proposal that a model makes: not of the first ones, which are drawn.
+
+    NaN if all are.
+    """
+    drawn = N_SOBOL if method == BO_LATER else 1
+    some = of.trials[(of.trials["method"] == method) & (of.trials["trial"] > drawn)]
+    return float(some[column].median())

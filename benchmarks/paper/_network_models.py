@@ -72,6 +72,11 @@ MODELS = {
 }
 
 
+def shown(model: str) -> str:
+    """Name of a row in text and figures, which say what is found on it."""
+    return {"constant": "best logged network", "simulator": "simulator itself"}.get(model, model)
+
+
 def bounds() -> Floats:
     """Range of the weights (31, 2): what enters the hidden units is of order one."""
     hidden = POLICY.hidden[0]

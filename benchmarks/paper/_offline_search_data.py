@@ -5,8 +5,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from scipy.spatial.distance import cdist
-from sklearn.pipeline import Pipeline
 
 from benchmarks.paper._flights_data import (
     MOTION_UNTIL,
@@ -19,7 +17,6 @@ from benchmarks.paper._flights_data import (
     starts,
     tracking_errors,
 )
-from benchmarks.paper._flights_kernel import gain_scaler
 from benchmarks.paper._flights_models import follow
 from benchmarks.paper._flights_ranking import repeats
 from trajlearn import BlockKFold, TrajectoryDataset
@@ -193,34 +190,6 @@ def _errors_of(model: Any, ds: TrajectoryDataset, start_logged: NDArray[np.bool_
 
 
 # -- gains ---------------------------------------------------------------------------------
-
-
-def from_the_best(candidates: Pool, known: Ints, experiments: Ints) -> Floats:
-    """Distance of gains from those of the best known experiment of the same group.
-
-    Gains on a logarithmic scale, standardised over the known experiments of the group; infinite
-    where the group has none.
-    """
-    result = np.full(len(experiments), np.inf)
-    group = candidates.table["group"].to_numpy()
-    for name in np.unique(group[experiments]):
-        own, mine = known[group[known] == name], group[experiments] == name
-        if len(own):
-            scaler: Pipeline = gain_scaler().fit(candidates.gains(own))
-            best = candidates.gains(own[[candidates.flown[own].argmin()]])
-            asked = scaler.transform(candidates.gains(experiments[mine]))
-            result[mine] = np.linalg.norm(asked - scaler.transform(best), axis=1)
-    return result
-
-
-def from_all(candidates: Pool, known: Ints, experiments: Ints) -> Floats:
-    """Minus the distance of gains from the nearest known experiment; all of one group.
-
-    Gains on a logarithmic scale, standardised over the known and the asked ones.
-    """
-    near, far = candidates.gains(known), candidates.gains(experiments)
-    scaler: Pipeline = gain_scaler().fit(np.concatenate([near, far]))
-    return -cdist(scaler.transform(far), scaler.transform(near)).min(axis=1)
 
 
 def distinct_gains(candidates: Pool, group: str) -> dict[str, Floats]:

@@ -9,8 +9,9 @@ from benchmarks.paper._command import Tables
 from benchmarks.paper._figures import legend_below
 from benchmarks.paper._flights_tables import MAIN
 from benchmarks.paper._offline_search_data import LATE, RANDOM
-from benchmarks.paper._offline_search_ranking import GP, RIDGE, USUAL, T
-from benchmarks.paper._offline_search_trials import CHANCE, N_INITIAL, ROWS, WITHIN
+from benchmarks.paper._offline_search_ranking import USUAL
+from benchmarks.paper._offline_search_rows import CHANCE, GP, RIDGE, T
+from benchmarks.paper._offline_search_trials import N_INITIAL, ROWS, WITHIN
 from trajlearn.plotting._style import GREY, INK, line_style, tidy
 
 if TYPE_CHECKING:

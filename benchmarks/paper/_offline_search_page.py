@@ -7,8 +7,9 @@ from benchmarks.paper._command import Tables, markdown
 from benchmarks.paper._flights_tables import MAIN
 from benchmarks.paper._intervals import rounded
 from benchmarks.paper._offline_search_data import EARLY, FIFTH, LATE, RANDOM, SPLITS
-from benchmarks.paper._offline_search_ranking import FLOWN, NO_GAINS, OWN, TASTES, USUAL, T
-from benchmarks.paper._offline_search_trials import CHANCE, FAR, N_INITIAL, TUNER
+from benchmarks.paper._offline_search_ranking import FLOWN, OWN, TASTES, USUAL
+from benchmarks.paper._offline_search_rows import CHANCE, FAR, NO_GAINS, T
+from benchmarks.paper._offline_search_trials import N_INITIAL, TUNER
 
 CHANCE_ROW = "at random"
 _TITLES = {
@@ -19,6 +20,8 @@ _TITLES = {
 }
 #: Gains that are listed of a group.
 _N_GAINS = 6
+# far below what the tables hold, five digits
+_NOTHING = 1e-9
 
 
 def report(tables: Tables) -> str:
@@ -26,7 +29,8 @@ def report(tables: Tables) -> str:
     choices = tables["choices"]
     lines = [
         "A model chooses among experiments that it has not seen, before they are flown: it is told "
-        "the gains, the set-point and a usual start (the median of the training flights). "
+        "the gains, the set-point and a usual start (the median of the training flights of that "
+        "kind). "
         "Tracking error: root mean square along the driven axes, over the part of the motion that "
         "all flights of a kind log, mean over the flights of an experiment. Regret: the flown "
         "error of the experiment with the least predicted one, minus the best flown of those held "
@@ -68,8 +72,9 @@ def _pool(table: pd.DataFrame) -> list[str]:
     )
     return [
         "A standard deviation between flights with the same gains is what no model of the gains "
-        "can know; a regret below it is none. Nor can a ranking of single flights be better than "
-        "that by their own repeats.",
+        "can know: a regret below it may be chance. The rank correlation of flights with the mean "
+        "of their repeats says how much of an error comes back. It is no upper limit: repeats "
+        "scatter themselves, and a model that knew the expected error would do somewhat better.",
         "",
         markdown(shown),
     ]
@@ -84,7 +89,9 @@ def _over(values: pd.Series, digits: int = 2) -> str:
     there = values.dropna()
     if not len(there):
         return "none"
-    low, mean, high = (rounded(v, digits) for v in (there.min(), there.mean(), there.max()))
+    # a mean of numbers that cancel is 0, not what rounding leaves of it
+    exact = [0.0 if abs(v) < _NOTHING else v for v in (there.min(), there.mean(), there.max())]
+    low, mean, high = (rounded(v, digits) for v in exact)
     return mean if low == high else f"{mean} ({low} to {high})"
 
 
@@ -160,9 +167,10 @@ def _best(choices: pd.DataFrame) -> list[str]:
 def _starts(choices: pd.DataFrame) -> list[str]:
     lines = [
         "The same models, told the first state in each flight's own log. Where the beginning of "
-        "the motion is not in the log, that state is in the middle of it and shows how well the "
-        f"flight goes: {NO_GAINS} then ranks flights without knowing their gains, and before a "
-        "flight (from the usual start) it cannot. Who chooses gains has no such state.",
+        "the motion is not in the log, that state is in the middle of it. A flight's "
+        f"own first state is all that {NO_GAINS} can rank by: from the usual start its predictions "
+        "are all equal. "
+        "Who chooses gains has no such state.",
         "",
     ]
     shown = []
@@ -183,9 +191,10 @@ def _own_rows(choices: pd.DataFrame) -> list[str]:
 def _gains(table: pd.DataFrame) -> list[str]:
     lines = [
         "Rank correlation of a gain with the error over the held-out experiments, flown and as "
-        "predicted (below 0: more is better), of the gains that matter most in what was flown; and "
-        "the mean of the gain over the three best, against the median of all. Values: how many the "
-        "gain has in training (mean over splits): what was never varied there, no model can know. "
+        "predicted (below 0: more is better), of the gains with the strongest correlation in what "
+        "was flown; and the mean of the gain over the three best, against the median of all. "
+        "Values: how many the gain has in training (mean over splits): what was never varied "
+        "there, no model can know. "
         "Gains that were only changed together stand together.",
     ]
     agree = []

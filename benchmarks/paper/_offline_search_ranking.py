@@ -7,7 +7,6 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from benchmarks.paper._flights_models import build
-from benchmarks.paper._flights_ranking import _with_target, nearest, pooled_gp
 from benchmarks.paper._offline_search_data import (
     EARLY,
     FIFTH,
@@ -16,7 +15,6 @@ from benchmarks.paper._offline_search_data import (
     SPLITS,
     Pool,
     distinct_gains,
-    from_the_best,
     held_out,
     n_folds,
     noise,
@@ -24,14 +22,22 @@ from benchmarks.paper._offline_search_data import (
     predicted_before,
     predicted_from_own_start,
 )
+from benchmarks.paper._offline_search_rows import (
+    BEST_GAINS,
+    GP,
+    IN_TIME,
+    MEAN,
+    NO_FORECAST,
+    NO_GAINS,
+    RIDGE,
+    C,
+    T,
+    from_gains,
+)
 from trajlearn import rank_correlation
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
 
-T, NO_GAINS, C = "T, tracking error", "T, tracking error, no gains", "C"
-MEAN, RIDGE, GP = "mean flight", "kernel ridge", "direct GP"
-BEST_GAINS, IN_TIME = "near the best gains", "nearest in time"
 #: Rows of one cell; those of the first do not depend on a seed.
 CELLS = [[MEAN, RIDGE, GP, BEST_GAINS, IN_TIME], [T], [NO_GAINS], [C]]
 #: Rows that are shown from the start that was flown as well.
@@ -76,8 +82,8 @@ def cell(rows: list[str], split: str, fold: int, mode: str, seed: int) -> dict[s
     train, test = held_out(candidates, split, fold)
     scores: dict[str, dict[str, Floats]] = {}
     for row in rows:
-        if row in (GP, BEST_GAINS, IN_TIME):
-            scores[row] = {USUAL: _without_states(row, candidates, train, test, seed)}
+        if row in NO_FORECAST:
+            scores[row] = {USUAL: from_gains(row, candidates, train, test, seed)}
             continue
         known = candidates.flights_of(train)
         model = build(row, mode, seed).fit(candidates.every.ds[known])
@@ -85,30 +91,6 @@ def cell(rows: list[str], split: str, fold: int, mode: str, seed: int) -> dict[s
         if row in FROM_OWN_START:
             scores[row][OWN] = predicted_from_own_start(model, candidates, test)
     return {"experiments": test, "rows": scores}
-
-
-def _without_states(row: str, candidates: Pool, train: Ints, test: Ints, seed: int) -> Floats:
-    if row == BEST_GAINS:
-        return from_the_best(candidates, train, test)
-    known = candidates.flights_of(train)
-    first = candidates.table["first"].to_numpy()[test]
-    if row == IN_TIME:
-        found = [nearest(candidates.every, known, i, candidates.errors) for i in first]
-        return np.nan_to_num(np.array(found), nan=np.inf)
-    return direct_gp(candidates, known, first, seed)[0]
-
-
-def direct_gp(
-    candidates: Pool, known: Ints, asked: Ints, seed: int, kappa: float = 0.0
-) -> tuple[Floats, Floats]:
-    """Tracking errors [m] of flights, and their lower confidence bound, by the direct GP.
-
-    It learns the logarithm of the error, from gains and kind of flight alone.
-    """
-    ds, log_error = candidates.every.ds, np.log(candidates.errors)
-    model = pooled_gp(seed).fit(_with_target(ds[known], log_error[known]))
-    mean, std = model.predict(ds[asked], return_std=True)
-    return np.exp(mean), np.exp(mean - kappa * std)
 
 
 # -- what a choice is worth ------------------------------------------------------------------

@@ -7,26 +7,29 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from benchmarks.paper._flights_models import build
-from benchmarks.paper._offline_search_data import (
-    Pool,
-    from_all,
-    from_the_best,
-    pool,
-    predicted_before,
+from benchmarks.paper._offline_search_data import Pool, pool, predicted_before
+from benchmarks.paper._offline_search_rows import (
+    BEST_GAINS,
+    CHANCE,
+    FAR,
+    GP,
+    LCB,
+    NO_FORECAST,
+    RIDGE,
+    T,
+    from_gains,
 )
-from benchmarks.paper._offline_search_ranking import BEST_GAINS, GP, RIDGE, T, direct_gp
 
 Ints = NDArray[np.intp]
 Floats = NDArray[np.float64]
 
-LCB, FAR, CHANCE, TUNER = f"{GP}, LCB", "far from what was tried", "random", "as flown"
 #: Rows; those after the models ask for no flown error but the least, or for none.
 ROWS = (T, RIDGE, GP, LCB, BEST_GAINS, FAR, CHANCE)
+#: The order of the human tuner.
+TUNER = "as flown"
 N_INITIAL = 5
 #: Gradient steps of T, which is fitted again before every trial.
 STEPS = {"full": 400, "quick": 100}
-#: Of the standard deviation, in the lower confidence bound.
-KAPPA = 1.0
 #: Orders at random for each set of first trials.
 N_CHANCE = 20
 #: A trial as good as that has found what there is to find.
@@ -90,16 +93,9 @@ def _order(
 
 def _scores(row: str, candidates: Pool, tried: Ints, rest: Ints, seed: int, n_steps: int) -> Floats:
     """What a row, knowing what was tried, expects of the others: less is better."""
-    if row == CHANCE:
-        return np.zeros(len(rest))
-    if row == BEST_GAINS:
-        return from_the_best(candidates, tried, rest)
-    if row == FAR:
-        return from_all(candidates, tried, rest)
+    if row in NO_FORECAST:
+        return from_gains(row, candidates, tried, rest, seed)
     known = candidates.flights_of(tried)
-    if row in (GP, LCB):
-        first = candidates.table["first"].to_numpy()[rest]
-        return direct_gp(candidates, known, first, seed, KAPPA)[row == LCB]
     model = build(row, "full", seed)
     if row == T:
         model.set_params(estimator__max_steps=n_steps)

@@ -67,6 +67,10 @@ def label(hold: int | str | None) -> str:
     return "random gains" if hold == "random" else f"planned, hold {hold}"
 
 
+#: Of all logs, in the order in which they are shown.
+LABELS = [label(hold) for hold in HOLDS]
+
+
 def _fit(ds: TrajectoryDataset, mode: str, seed: int) -> Any:
     return build("T", "default", policy=None, mode=mode, seed=seed).fit(ds)
 

@@ -1,5 +1,6 @@
 """Planners of the cartpole, their trials, and what a model says of the choices that they face."""
 
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -28,6 +29,8 @@ EVERY = 10
 # states of a trial from which choices are looked at, and parameters that are compared there
 _LOOKED_AT_STEPS = (0, 25, 50, 100)
 N_CHOICES = 200
+#: Return per step below which gains are bad.
+BAD = 0.5
 
 
 class Planner(NamedTuple):
@@ -60,6 +63,12 @@ PLANNERS = {
 }
 #: Planners whose states are looked at.
 LOOKED_AT = ["T, hold all", "T, hold 25"]
+
+
+def ordered(names: Iterable[str]) -> list[str]:
+    """Planners among the names, in the order in which they are shown."""
+    present = set(names)
+    return [name for name in PLANNERS if name in present]
 
 
 def starts(n: int) -> Floats:
@@ -218,8 +227,8 @@ def choices(planner: str, model: str, mode: str, seed: int) -> list[dict[str, An
                     "mean": float(true.mean()),
                     "speed_factor": float(theta[pick, 1] / lqr_gain()[1]),
                     "rate_factor": float(theta[pick, 3] / lqr_gain()[3]),
-                    "low": float(np.mean(true < 0.5)),
-                    "pick_low": bool(true[pick] < 0.5),
+                    "low": float(np.mean(true < BAD)),
+                    "pick_low": bool(true[pick] < BAD),
                 }
             )
     return lines

@@ -2,8 +2,8 @@
 
 After every trial a model is fitted anew, the best theta is searched in it and tried next. T with
 CMA-ES and with gradients, one-step models, a direct Gaussian process, Bayesian optimisation and
-random search share first trial, initial states and budget. The best return so far by trial,
-median over 25 repeats on cartpole (ten on reacher), with the 66th and 95th percentiles.
+random search share first trial, initial states and number of trials. The best return so far by
+trial, median over 25 repeats on cartpole (ten on reacher), with the ranges of 66 % and 95 %.
 (The paper: its figure of iterative learning, T and Bayesian optimisation on cartpole.)
 """
 
@@ -59,7 +59,7 @@ def settings(mode: str) -> dict[str, Any]:
             "length": task.length,
             "bounds": task.bounds.tolist(),
             "terminal_reward": task.terminal_reward,
-            "n_repeats": N_REPEATS[name],
+            "n_repeats_at_most": N_REPEATS[name],
             "n_test_starts": len(task.test_starts),
             "n_planned_starts": N_PLANNED[name],
             "every": EVERY[name],

@@ -13,7 +13,8 @@ import pandas as pd
 
 from benchmarks.paper import _network_models as models
 from benchmarks.paper._command import Benchmark, Run, Tables
-from benchmarks.paper._network_page import draw, report
+from benchmarks.paper._network_figures import draw
+from benchmarks.paper._network_page import report
 
 
 def run(run: Run) -> Tables:

@@ -11,6 +11,7 @@ best is found?
 from typing import Any
 
 from benchmarks.paper import _offline_search_ranking as ranking
+from benchmarks.paper import _offline_search_rows as rows
 from benchmarks.paper import _offline_search_trials as trials
 from benchmarks.paper._command import Benchmark, Run, Tables
 from benchmarks.paper._flights_data import COMMON_FROM, FOLDER, MOTION_UNTIL
@@ -49,11 +50,11 @@ def settings(mode: str) -> dict[str, Any]:
             "rows": trials.ROWS,
             "repeats": trials.N_REPEATS[mode],
             "initial": trials.N_INITIAL,
-            "kappa": trials.KAPPA,
+            "kappa": rows.KAPPA,
         },
         "estimators": {
             row: " ".join(str(build(row, mode, 0)).split())
-            for row in (ranking.T, ranking.NO_GAINS, ranking.C, ranking.RIDGE)
+            for row in (rows.T, rows.NO_GAINS, rows.C, rows.RIDGE)
         },
     }
 

@@ -15,7 +15,8 @@ from benchmarks._sweep import Cell
 from benchmarks.paper import _planning_refit as refits
 from benchmarks.paper import _planning_trials as trials
 from benchmarks.paper._command import Benchmark, Run, Tables
-from benchmarks.paper._planning_page import draw, report
+from benchmarks.paper._planning_figures import draw
+from benchmarks.paper._planning_page import report
 
 
 def run(run: Run) -> Tables:

@@ -1,1 +1,1 @@
-"""Speed of training, predicting and relabelling, side by side with others; see README.md."""
+"""Speed of training, predicting, planning and relabelling beside others; see README.md."""

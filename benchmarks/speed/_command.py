@@ -7,6 +7,7 @@ import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import torch
@@ -44,6 +45,29 @@ def parser(name: str, about: str) -> argparse.ArgumentParser:
         f"results/speed/{name} in quick mode)",
     )
     return options
+
+
+def command_line(
+    name: str,
+    about: str,
+    run: Callable[..., dict[str, Any]],
+    effort: Mapping[str, Any],
+    columns: Columns,
+    argv: Sequence[str] | None,
+    *,
+    flags: Mapping[str, str] = MappingProxyType({}),
+) -> None:
+    """What every benchmark's `main` does: ``run(mode, effort[mode])``, the table, the files.
+
+    `flags` are further options by name, with their help; `run` gets them as keyword arguments.
+    """
+    options = parser(name, about)
+    for flag, text in flags.items():
+        options.add_argument(f"--{flag}", action="store_true", help=text)
+    given = options.parse_args(argv)
+    mode = "quick" if given.quick else "full"
+    asked = {flag: getattr(given, flag) for flag in flags}
+    finish(name, run(mode, effort[mode], **asked), columns, given.out)
 
 
 def result(name: str, mode: str, rows: list[Row], settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,71 +6,36 @@ rewards, ends of trajectories and the choice.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from benchmarks.speed._command import (
-    Columns,
-    Row,
-    duration,
-    finish,
-    one_thread,
-    parser,
-    quartiles,
-    result,
-    times,
+from benchmarks.speed._candidates import (
+    EVERY,
+    HIDDEN,
+    Effort,
+    bare_products,
+    columns,
+    learner,
+    run_candidates,
 )
-from benchmarks.speed._gemm import forward_products
-from benchmarks.speed._timing import Case, measure
-from benchmarks.speed.predict import BLOCK, EVERY, HIDDEN
-from trajlearn import Cartpole, MLPEnsembleRegressor, OneStepRegressor, TrajectoryRegressor
-from trajlearn.control.mpc import MPC
+from benchmarks.speed._command import command_line
+from benchmarks.speed._timing import Case
+from trajlearn import Cartpole, OneStepRegressor, TrajectoryRegressor
+from trajlearn.control import MPC
 
 NAME = "plan"
-
-COLUMNS: Columns = {
-    "candidates": lambda row: str(row["candidates"]),
-    "what": lambda row: row["case"],
-    "time": lambda row: duration(row["seconds"]),
-    "GEMM": lambda row: times(row["ratio"]),
-    "quartiles": quartiles,
-    "decisions/s": lambda row: f"{1 / row['seconds']:.3g}",
-    "goal": lambda row: row["goal"],
-}
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How much to run; the models need not be good, only of the right size."""
-
-    rounds: int
-    fit_steps: int
-    candidates: Sequence[int] = (100, 1000)
-    n_steps: int = 200
-    min_seconds: float = 0.0
-
-
+COLUMNS = columns("decisions/s", lambda row: f"{1 / row['seconds']:.3g}")
+CANDIDATES = (100, 1000)
 EFFORT = {
-    "quick": Effort(rounds=3, fit_steps=500),
-    "full": Effort(rounds=15, fit_steps=1000, min_seconds=0.05),
+    "quick": Effort(rounds=3, fit_steps=500, candidates=CANDIDATES),
+    "full": Effort(rounds=15, fit_steps=1000, candidates=CANDIDATES, min_seconds=0.05),
 }
 
 
 def run(mode: str, effort: Effort) -> dict[str, Any]:
     """Fit the models once, then time decisions for each number of candidates."""
-    with one_thread():
-        planners = _Planners(effort.fit_steps, effort.n_steps)
-        rows: list[Row] = []
-        for n in effort.candidates:
-            rows += measure(
-                planners.cases(n),
-                rounds=effort.rounds,
-                min_seconds=effort.min_seconds,
-                candidates=n,
-            )
-    return result(NAME, mode, rows, {"sizes": planners.sizes, "block": BLOCK, **asdict(effort)})
+    return run_candidates(NAME, mode, effort, _Planners)
 
 
 class _Planners:
@@ -80,11 +45,9 @@ class _Planners:
         self.env = Cartpole()
         self.n_steps = n_steps
         episodes = self.env.collect(20, n_steps, random_state=0)
-        learner = MLPEnsembleRegressor(
-            hidden_layer_sizes=HIDDEN, batch_size=128, max_steps=fit_steps
-        )
-        self.trajectory = TrajectoryRegressor(learner, random_state=0).fit(episodes)
-        self.one_step = OneStepRegressor(learner, policy=self.env.policy, random_state=0)
+        network = learner(fit_steps)
+        self.trajectory = TrajectoryRegressor(network, random_state=0).fit(episodes)
+        self.one_step = OneStepRegressor(network, policy=self.env.policy, random_state=0)
         self.one_step.fit(episodes)
         # a pole that can still be caught
         self.state = episodes[int(np.argmax(episodes.lengths))].states[0]
@@ -93,10 +56,9 @@ class _Planners:
 
     def cases(self, n: int) -> list[Case]:
         """Everything that is timed for n candidates; the first is the bare products."""
-        n_rows = n * self.n_steps
         goals = ("1.3x", "0.43x") if n == 1000 else ("", "")
         return [
-            Case("bare GEMM", forward_products(self.sizes, n_rows, min(BLOCK, n_rows))),
+            Case("bare GEMM", bare_products(self.sizes, n * self.n_steps)),
             Case("T over policies", self._decision(self.trajectory, n), goal=goals[0]),
             Case(
                 f"T over policies, every {EVERY}th step",
@@ -130,9 +92,7 @@ class _Planners:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Command line."""
-    given = parser(NAME, __doc__ or "").parse_args(argv)
-    mode = "quick" if given.quick else "full"
-    finish(NAME, run(mode, EFFORT[mode]), COLUMNS, given.out)
+    command_line(NAME, __doc__ or "", run, EFFORT, COLUMNS, argv)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ T's network over all rows, one member, in blocks that stay in cache, whatever th
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -14,76 +13,32 @@ import torch
 from numpy.typing import NDArray
 from sklearn.neural_network import MLPRegressor
 
-from benchmarks.speed._command import (
-    Columns,
-    Row,
-    duration,
-    finish,
-    one_thread,
-    parser,
-    quartiles,
-    result,
-    times,
+from benchmarks.speed._candidates import (
+    EVERY,
+    HIDDEN,
+    Effort,
+    bare_products,
+    columns,
+    learner,
+    run_candidates,
 )
-from benchmarks.speed._gemm import forward_products
-from benchmarks.speed._timing import Case, measure
-from trajlearn import (
-    Cartpole,
-    MLPEnsembleRegressor,
-    OneStepRegressor,
-    TrajectoryDataset,
-    TrajectoryRegressor,
-)
+from benchmarks.speed._command import command_line
+from benchmarks.speed._timing import Case
+from trajlearn import Cartpole, OneStepRegressor, TrajectoryDataset, TrajectoryRegressor
 
 NAME = "predict"
-# rows of a block of the bare products, the fastest of those tried
-BLOCK = 200
-EVERY = 10
-HIDDEN = (250, 250)
-
-COLUMNS: Columns = {
-    "candidates": lambda row: str(row["candidates"]),
-    "what": lambda row: row["case"],
-    "time": lambda row: duration(row["seconds"]),
-    "GEMM": lambda row: times(row["ratio"]),
-    "quartiles": quartiles,
-    "trajectories/s": lambda row: f"{row['candidates'] / row['seconds']:,.0f}",
-    "goal": lambda row: row["goal"],
-}
-
-Floats = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Effort:
-    """How much to run; the models need not be good, only of the right size."""
-
-    rounds: int
-    fit_steps: int
-    candidates: Sequence[int] = (1, 10, 100, 1000)
-    n_steps: int = 200
-    min_seconds: float = 0.0
-
-
+COLUMNS = columns("trajectories/s", lambda row: f"{row['candidates'] / row['seconds']:,.0f}")
 EFFORT = {
     "quick": Effort(rounds=3, fit_steps=500),
     "full": Effort(rounds=15, fit_steps=1000, min_seconds=0.05),
 }
 
+Floats = NDArray[np.float64]
+
 
 def run(mode: str, effort: Effort) -> dict[str, Any]:
     """Fit every model once, then time them for each number of candidates."""
-    with one_thread():
-        models = _Models(effort.fit_steps, effort.n_steps)
-        rows: list[Row] = []
-        for n in effort.candidates:
-            rows += measure(
-                models.cases(n),
-                rounds=effort.rounds,
-                min_seconds=effort.min_seconds,
-                candidates=n,
-            )
-    return result(NAME, mode, rows, {"sizes": models.sizes, "block": BLOCK, **asdict(effort)})
+    return run_candidates(NAME, mode, effort, _Models)
 
 
 class _Models:
@@ -94,10 +49,10 @@ class _Models:
         self.n_steps = n_steps
         episodes = self.env.collect(20, n_steps, random_state=0)
         self.episodes = episodes
-        self.trajectory = TrajectoryRegressor(_learner(fit_steps), random_state=0).fit(episodes)
+        self.trajectory = TrajectoryRegressor(learner(fit_steps), random_state=0).fit(episodes)
         self.one_step = {
             n_members: OneStepRegressor(
-                _learner(fit_steps, n_members), policy=self.env.policy, random_state=0
+                learner(fit_steps, n_members), policy=self.env.policy, random_state=0
             ).fit(episodes)
             for n_members in (1, 5)
         }
@@ -134,7 +89,7 @@ class _Models:
                 return self.naive(single)
 
         return [
-            Case("bare GEMM", forward_products(self.sizes, len(rows), min(BLOCK, len(rows)))),
+            Case("bare GEMM", bare_products(self.sizes, len(rows))),
             Case("T, predict_trajectory", forecast(model, horizons), goal=goal),
             Case(f"T, every {EVERY}th horizon", forecast(model, horizons[EVERY - 1 :: EVERY])),
             Case("T, Predictor on the product", self._product(states, params), goal=goal),
@@ -166,12 +121,6 @@ class _Models:
         return lambda: product(left, right, (rest, horizon), index)
 
 
-def _learner(fit_steps: int, n_members: int = 1) -> MLPEnsembleRegressor:
-    return MLPEnsembleRegressor(
-        hidden_layer_sizes=HIDDEN, n_members=n_members, batch_size=128, max_steps=fit_steps
-    )
-
-
 def _starts(episodes: TrajectoryDataset, n: int) -> tuple[Floats, Floats]:
     """Initial states and gains of n candidates, taken from the episodes in turn."""
     episode = np.arange(n) % len(episodes)
@@ -183,9 +132,7 @@ def _starts(episodes: TrajectoryDataset, n: int) -> tuple[Floats, Floats]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Command line."""
-    given = parser(NAME, __doc__ or "").parse_args(argv)
-    mode = "quick" if given.quick else "full"
-    finish(NAME, run(mode, EFFORT[mode]), COLUMNS, given.out)
+    command_line(NAME, __doc__ or "", run, EFFORT, COLUMNS, argv)
 
 
 if __name__ == "__main__":

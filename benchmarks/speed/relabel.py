@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from benchmarks.speed._command import (
     Columns,
     Row,
+    command_line,
     duration,
-    finish,
     one_thread,
-    parser,
     quartiles,
     result,
     times,
@@ -185,9 +184,7 @@ def _loop(ds: TrajectoryDataset) -> tuple[list[Floats], list[Floats]]:
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Command line."""
-    given = parser(NAME, __doc__ or "").parse_args(argv)
-    mode = "quick" if given.quick else "full"
-    finish(NAME, run(mode, EFFORT[mode]), COLUMNS, given.out)
+    command_line(NAME, __doc__ or "", run, EFFORT, COLUMNS, argv)
 
 
 if __name__ == "__main__":

@@ -18,10 +18,9 @@ from benchmarks.speed import _mbrl
 from benchmarks.speed._command import (
     Columns,
     Row,
+    command_line,
     duration,
-    finish,
     one_thread,
-    parser,
     quartiles,
     result,
     times,
@@ -168,15 +167,10 @@ def _data_loader(x: torch.Tensor, y: torch.Tensor, batch_size: int) -> Callable[
 
 def main(argv: Sequence[str] | None = None) -> None:
     """Command line."""
-    options = parser(NAME, __doc__ or "")
-    options.add_argument(
-        "--mbrl",
-        action="store_true",
-        help="also mbrl-lib's trainer, in an environment of its own (made on first use, minutes)",
-    )
-    given = options.parse_args(argv)
-    mode = "quick" if given.quick else "full"
-    finish(NAME, run(mode, EFFORT[mode], mbrl=given.mbrl), COLUMNS, given.out)
+    flags = {
+        "mbrl": "also mbrl-lib's trainer, in an environment of its own (made on first use, minutes)"
+    }
+    command_line(NAME, __doc__ or "", run, EFFORT, COLUMNS, argv, flags=flags)
 
 
 if __name__ == "__main__":

@@ -10,9 +10,25 @@ import pytest
 from benchmarks.paper import _control_tasks, _iterative_methods, iterative_learning
 from benchmarks.paper._control_tasks import CONTROL_TASKS, PAPER_START, normalised
 from benchmarks.paper._iterative_figures import draw
-from benchmarks.paper._iterative_methods import BO, DISTILLED, METHODS, OF_TASK, RANDOM, repeat
+from benchmarks.paper._iterative_methods import (
+    BO,
+    BO_LATER,
+    DISTILLED,
+    METHODS,
+    N_SOBOL,
+    OF_TASK,
+    RANDOM,
+    repeat,
+)
 from benchmarks.paper._iterative_page import report
-from benchmarks.paper._iterative_tables import behind, first_near, median_behind, result, spread
+from benchmarks.paper._iterative_tables import (
+    behind,
+    first_near,
+    median_behind,
+    result,
+    seconds,
+    spread,
+)
 from benchmarks.paper.iterative_learning import BENCHMARK, settings
 
 # -- tasks ----------------------------------------------------------------------------------------
@@ -213,6 +229,26 @@ def test_the_best_known_is_never_less_than_the_best_seen():
     some = tables()
     some["cartpole-scale"]["test"] = 0.9
     assert result(some).best == pytest.approx(0.984)
+    assert "0.984 per step, of a trial, better than what is found by CMA-ES" in report(some)
+    assert "1 per step, found by CMA-ES on the simulator itself (100 controllers)" in report(
+        tables()
+    )
+
+
+def test_time_is_that_of_proposals_that_a_model_makes():
+    some = tables()
+    lines = [
+        {"method": BO_LATER, "repeat": number, "trial": k, "true": 0.5, "seen": 0.5, "steps": 200}
+        | {"seconds_fit": 0.0, "seconds_search": 0.001 if k <= N_SOBOL else 0.2}
+        for number in range(5)
+        for k in range(1, N_SOBOL + 2)
+    ]
+    some["cartpole"] = pd.concat([some["cartpole"], pd.DataFrame(lines)], ignore_index=True)
+    assert seconds(result(some), BO_LATER, "seconds_search") == 0.2
+    some["cartpole"] = some["cartpole"][some["cartpole"]["trial"] <= 3]
+    assert np.isnan(seconds(result(some), BO_LATER, "seconds_search"))
+    assert f"| {BO_LATER} |  |  | 200 |" in report(some)
+    assert seconds(result(some), BO, "seconds_search") == 2.0
 
 
 def test_behind_counts_repeats_and_medians():
@@ -234,7 +270,7 @@ def test_the_text_answers_yes_and_no():
     assert (
         f"{DISTILLED}: within 5 % of the best known by trial 3 in the median: **yes** (0." in text
     )
-    assert "in the median from trial 2 to 3: **no**, behind at trial 3 (by 0.010)" in text
+    assert "in the median from trial 2 to 3: **no**, behind at trial 3 (by 0.01)" in text
     assert "the centre of the search box scores 0.920, and the theta at which the paper's" in text
     assert f"| {BO} | 0.502 (0.50 to 0.50) | 0.602 (0.60 to 0.60) | 0.98" in text
     assert "| random |" in text

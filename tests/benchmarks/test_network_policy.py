@@ -9,6 +9,7 @@ from sklearn.linear_model import LinearRegression
 
 from benchmarks.paper import _models, _network_models, network_policy
 from benchmarks.paper._command import read_tables
+from benchmarks.paper._network_figures import draw
 from benchmarks.paper._network_models import (
     INPUT_SCALE,
     LENGTH,
@@ -24,7 +25,7 @@ from benchmarks.paper._network_models import (
     probes,
     true_returns,
 )
-from benchmarks.paper._network_page import draw, report
+from benchmarks.paper._network_page import report
 from trajlearn import OneStepRegressor
 
 
@@ -166,7 +167,8 @@ def test_the_text_says_who_wins():
     assert (
         "- 400 episodes: D, policy ranks best (0.99), of those that do not roll the network out "
         "T, responses (0.80). Better networks than the best logged one (0.60) are found on: "
-        "D, policy, T, responses." in text
+        "D, policy, T, responses. What is found is furthest below its prediction on T, weights "
+        "(by 0.80)." in text
     )
     assert "nan" not in text
 

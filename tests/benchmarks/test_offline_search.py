@@ -7,7 +7,9 @@ import pandas as pd
 import pytest
 
 from benchmarks.paper import _flights_data, _flights_kernel, _flights_models
+from benchmarks.paper import _offline_search_page as page
 from benchmarks.paper import _offline_search_ranking as ranking
+from benchmarks.paper import _offline_search_rows as rows
 from benchmarks.paper import _offline_search_trials as trials
 from benchmarks.paper._flights_tables import MAIN, STATES
 from benchmarks.paper._offline_search_data import (
@@ -16,14 +18,13 @@ from benchmarks.paper._offline_search_data import (
     RANDOM,
     SPLITS,
     distinct_gains,
-    from_all,
-    from_the_best,
     held_out,
     noise,
     planned,
     pool,
     predicted_before,
 )
+from benchmarks.paper._offline_search_rows import from_all, from_the_best
 from benchmarks.paper.offline_search import BENCHMARK
 from trajlearn import MeanEpisodeForecaster, TrajectoryDataset
 
@@ -131,15 +132,15 @@ def test_no_score_depends_on_how_the_held_out_experiments_were_flown(monkeypatch
     candidates = pool()
     test = held_out(candidates, RANDOM, 0)[1]
     names = candidates.table["experiment"].to_numpy()[test]
-    rows = [*ranking.CELLS[0], ranking.T]
-    asked = {"rows": rows, "split": RANDOM, "fold": 0, "mode": "quick", "seed": 0}
+    names_of_rows = [*ranking.CELLS[0], rows.T]
+    asked = {"rows": names_of_rows, "split": RANDOM, "fold": 0, "mode": "quick", "seed": 0}
     before = ranking.cell(**asked)["rows"]
     monkeypatch.setattr(_flights_data, "load", lambda: made_up(set(names)))
     after = ranking.cell(**asked)["rows"]
-    for row in rows:
+    for row in names_of_rows:
         assert np.array_equal(before[row][ranking.USUAL], after[row][ranking.USUAL])
     # from its own start a model has seen something of the flight
-    own = [scores[ranking.T][ranking.OWN] for scores in (before, after)]
+    own = [scores[rows.T][ranking.OWN] for scores in (before, after)]
     assert not np.allclose(*own)
 
 
@@ -234,10 +235,10 @@ def test_a_full_run_takes_every_split_and_as_many_halves_as_seeds():
     asked = pd.DataFrame(ranking.cells("full", list(range(10))))
     asked["first"] = asked["rows"].map(lambda rows: rows[0])
     counts = asked.groupby(["split", "first"]).size()
-    assert counts[RANDOM, ranking.T] == 10
-    assert counts[LATE, ranking.T] == 3
-    assert counts[FIFTH, ranking.T] == 5
-    assert counts[RANDOM, ranking.NO_GAINS] == 3
+    assert counts[RANDOM, rows.T] == 10
+    assert counts[LATE, rows.T] == 3
+    assert counts[FIFTH, rows.T] == 5
+    assert counts[RANDOM, rows.NO_GAINS] == 3
     assert set(asked["split"]) == set(SPLITS)
 
 
@@ -247,11 +248,11 @@ def test_a_full_run_takes_every_split_and_as_many_halves_as_seeds():
 def test_all_rows_begin_with_the_same_experiments_and_end_with_the_best():
     candidates = pool()
     every, first = candidates.of_group(MAIN), {}
-    for row in (trials.GP, trials.LCB, trials.BEST_GAINS, trials.FAR, trials.CHANCE):
+    for row in (rows.GP, rows.LCB, rows.BEST_GAINS, rows.FAR, rows.CHANCE):
         found = trials.cell(row, MAIN, [0, 1], 0)["orders"]
-        assert len(found) == 2 * (trials.N_CHANCE if row == trials.CHANCE else 1)
+        assert len(found) == 2 * (trials.N_CHANCE if row == rows.CHANCE else 1)
         for i, order in enumerate(found):
-            repeat = i // trials.N_CHANCE if row == trials.CHANCE else i
+            repeat = i // trials.N_CHANCE if row == rows.CHANCE else i
             assert len(set(order)) == len(order)
             first.setdefault(repeat, order[: trials.N_INITIAL])
             assert order[: trials.N_INITIAL] == first[repeat]
@@ -265,35 +266,37 @@ def test_all_rows_begin_with_the_same_experiments_and_end_with_the_best():
 def repeats_without_the_best(candidates):
     """Those whose first trials, at random, leave something to find."""
     best = candidates.flown[candidates.of_group(MAIN)].argmin()
-    orders = trials.cell(trials.CHANCE, MAIN, list(range(8)), 0)["orders"][:: trials.N_CHANCE]
+    orders = trials.cell(rows.CHANCE, MAIN, list(range(8)), 0)["orders"][:: trials.N_CHANCE]
     return [i for i, order in enumerate(orders) if best not in order[: trials.N_INITIAL]]
 
 
-@pytest.mark.parametrize("row", [trials.RIDGE, trials.GP, trials.T])
+@pytest.mark.parametrize("row", [rows.RIDGE, rows.GP, rows.T])
 def test_a_model_finds_the_best_gains_sooner_than_chance(row):
     candidates = pool()
     undecided = repeats_without_the_best(candidates)[:3]
     done = [
         ({"row": name, "group": MAIN}, trials.cell(name, MAIN, undecided, 60))
-        for name in (row, trials.CHANCE)
+        for name in (row, rows.CHANCE)
     ]
     hits = trials.tables(candidates, done)[1].groupby("row")["best"].mean()
-    assert hits[row] < hits[trials.CHANCE] - 1
+    assert hits[row] < hits[rows.CHANCE] - 1
 
 
 @pytest.mark.parametrize(
-    ("row", "function"), [(trials.GP, "direct_gp"), (trials.RIDGE, "predicted_before")]
+    ("row", "module", "function"),
+    [(rows.GP, rows, "direct_gp"), (rows.RIDGE, trials, "predicted_before")],
+    ids=["without a forecast", "with one"],
 )
-def test_a_search_knows_only_what_it_has_tried(monkeypatch, row, function):
+def test_a_search_knows_only_what_it_has_tried(monkeypatch, row, module, function):
     candidates, asked = pool(), []
-    real = getattr(trials, function)
+    real = getattr(module, function)
 
     def spy(*arguments):
         first = next(i for i, some in enumerate(arguments) if isinstance(some, np.ndarray))
         asked.append(set(candidates.of_flight[arguments[first]]))
         return real(*arguments)
 
-    monkeypatch.setattr(trials, function, spy)
+    monkeypatch.setattr(module, function, spy)
     (order,) = trials.cell(row, MAIN, repeats_without_the_best(candidates)[:1], 0)["orders"]
     assert len(asked) == len(order) - trials.N_INITIAL > 0
     for i, known in enumerate(asked):
@@ -305,13 +308,13 @@ def test_progress_is_the_least_error_so_far():
     main = candidates.of_group(SIDE)
     flown = 1e3 * candidates.flown[main]
     order = np.argsort(flown)[[3, 5, 1, 0]]
-    done = [({"row": trials.GP, "group": SIDE}, {"orders": [main[order].tolist()]})]
+    done = [({"row": rows.GP, "group": SIDE}, {"orders": [main[order].tolist()]})]
     progress, hits = trials.tables(candidates, done)
-    own = progress[progress["row"] == trials.GP]
+    own = progress[progress["row"] == rows.GP]
     want = np.sort(flown)[[3, 3, 1, 0, 0, 0, 0, 0]]
     assert own["median"].to_numpy() == pytest.approx(want)
     assert (own["q95"] == own["median"]).all()
-    assert hits[hits["row"] == trials.GP][["within", "best"]].to_numpy().tolist() == [[4, 4]]
+    assert hits[hits["row"] == rows.GP][["within", "best"]].to_numpy().tolist() == [[4, 4]]
     # in the order of flying: the best of these is the fifth
     assert hits[hits["row"] == trials.TUNER]["best"].tolist() == [5]
 
@@ -322,6 +325,14 @@ def test_groups_of_many_good_experiments_are_no_search(monkeypatch):
     # four in twelve are within 40 %, and two in eight
     monkeypatch.setattr(trials, "MOST", 0.3)
     assert trials.searched(pool()) == [SIDE]
+
+
+# -- text ------------------------------------------------------------------------------------------
+
+
+def test_correlations_that_cancel_are_zero():
+    assert page._over(pd.Series([0.1, 0.2, -0.3])) == "0 (-0.3 to 0.2)"
+    assert page._over(pd.Series([1e-3, 1e-3])) == "0.001"
 
 
 # -- the command ----------------------------------------------------------------------------------

@@ -8,7 +8,8 @@ import pytest
 
 from benchmarks.paper import _models, _planning_refit, _planning_trials, planning
 from benchmarks.paper._command import read_tables
-from benchmarks.paper._planning_page import draw, report
+from benchmarks.paper._planning_figures import draw
+from benchmarks.paper._planning_page import report
 from benchmarks.paper._planning_refit import COUNTED, usable
 from benchmarks.paper._planning_trials import (
     LENGTH,
@@ -207,6 +208,10 @@ def test_the_text_holds_what_the_tables_say():
     )
     assert "T, hold 1 and D over policies, hold all were not both run." in text
     assert "0.970 predicted, 0.200 true, with 1.40 and 0.50 times" in text
+    assert (
+        "Bad there: 3.0 % of the gains, 100 % of the favourites of T, 0 % of the favourites of D."
+        in text
+    )
     assert "0.500, 3 of 3 fell" in text
     assert "nan" not in text
 
