@@ -75,7 +75,12 @@ def predicts_rewards(model: Any) -> bool:
 
 def policy_of(model: Any, policy: Any) -> Any:
     """The policy that is given, or else that of the model; None if there is none."""
-    return getattr(unwrapped(model), "policy", None) if policy is None else policy
+    if policy is not None:
+        return policy
+    inner = unwrapped(model)
+    own = getattr(inner, "policy", None)
+    # the name of one that the model has learned from its logs
+    return getattr(inner, "policy_", None) if isinstance(own, str) else own
 
 
 def draws_from_generators(model: Any) -> bool:

@@ -1,5 +1,6 @@
 """Formulations of dynamics: relabel, scale, learn, forecast."""
 
+from trajlearn.dynamics._default_members import default_members
 from trajlearn.dynamics._differentiable import differentiable
 from trajlearn.dynamics.baselines import (
     CurveForecaster,
@@ -16,6 +17,7 @@ from trajlearn.dynamics.lstm import LSTMRegressor
 from trajlearn.dynamics.one_step import OneStepRegressor
 from trajlearn.dynamics.phase import PhaseFeatures
 from trajlearn.dynamics.scaling import BlockScaler
+from trajlearn.dynamics.selector import HorizonSelector
 from trajlearn.dynamics.trajectory import TrajectoryRegressor
 
 __all__ = [
@@ -28,11 +30,13 @@ __all__ = [
     "Forecast",
     "HoldForecaster",
     "HorizonFeatures",
+    "HorizonSelector",
     "LSTMRegressor",
     "MeanEpisodeForecaster",
     "OneStepRegressor",
     "PhaseFeatures",
     "ReferenceForecaster",
     "TrajectoryRegressor",
+    "default_members",
     "differentiable",
 ]

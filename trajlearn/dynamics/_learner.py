@@ -12,6 +12,7 @@ from sklearn.utils import get_tags
 from sklearn.utils.validation import has_fit_parameter
 
 from trajlearn.exceptions import NoUncertaintyError
+from trajlearn.regressors._polynomial import polynomial_predictor
 from trajlearn.regressors._prediction import mixture as mixture_of_members
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 
@@ -92,6 +93,9 @@ def moments_of(learner: Any, *, means_only: bool = False) -> Moments:
     if isinstance(learner, MultiOutputRegressor):
         # it has no return_std itself, though its parts may
         return _side_by_side([moments_of(e, means_only=means_only) for e in learner.estimators_])
+    lean = polynomial_predictor(learner)
+    if lean is not None:
+        return lambda rows: (lean(rows)[None], None)
     can = "return_std" in inspect.signature(learner.predict).parameters
     with_std = can and not means_only
 

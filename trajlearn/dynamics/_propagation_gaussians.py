@@ -62,10 +62,11 @@ def roll_gaussians(
     step: TransitionStep,
     limits: Limits,
     *,
+    initial_root: Floats | None = None,
     n_samples: int = 0,
     rng: np.random.Generator | None = None,
 ) -> Rolled:
-    """Apply a step of Gaussians again and again, from starts that are known exactly.
+    """Apply a step of Gaussians again and again.
 
     Parameters
     ----------
@@ -77,6 +78,8 @@ def roll_gaussians(
     step : callable
     limits : Limits
         Of the first d_s of the d numbers.
+    initial_root : ndarray of shape (n, d, d), optional
+        Lower root of the covariance of the starts; default: they are known exactly.
     n_samples : int, default=0
         Whole paths to draw through the same steps, each of one member.
     rng : Generator, optional
@@ -91,11 +94,13 @@ def roll_gaussians(
     d_s = len(limits.centre)
     shape = n_members, *initial.shape
     mean, root = np.broadcast_to(initial, shape), np.zeros((*shape, shape[-1]))
+    if initial_root is not None:
+        root = root + initial_root
     lost, wild = np.zeros((2, *shape[:2]), dtype=bool)
     means, variances = np.empty((2, *shape[:2], n_steps, d_s))
     paths = None
     if n_samples and rng is not None:
-        paths = _Paths(initial, n_samples, n_members, n_steps, limits, rng)
+        paths = _Paths(initial, initial_root, n_samples, n_members, n_steps, limits, rng)
     for k in range(n_steps):
         with np.errstate(over="ignore", invalid="ignore"):
             after = step(mean, root, k)
@@ -132,6 +137,7 @@ class _Paths:
     def __init__(
         self,
         initial: Floats,
+        initial_root: Floats | None,
         n_samples: int,
         n_members: int,
         n_steps: int,
@@ -141,6 +147,8 @@ class _Paths:
         self._rng, self._limits = rng, limits
         self._member = rng.permutation(np.arange(n_samples) % n_members)
         self._now = np.tile(initial, (n_samples, 1, 1))
+        if initial_root is not None:
+            self._now += applied(initial_root, rng.standard_normal(self._now.shape))
         self._gone = np.zeros((n_samples, len(initial)), dtype=bool)
         self.states = np.empty((n_samples, len(initial), n_steps, len(limits.centre)))
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from trajlearn.dynamics._propagation_algebra import applied
 from trajlearn.exceptions import MixedSamplingError
 from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories.times import episode_steps, time_grids
@@ -29,6 +30,8 @@ class Query:
         Absolute time of each step, extended past the log on a uniform grid.
     base : ndarray of shape (n, H + 1, d_s) or None
         The baseline at the start and at each step, where the states of `ds` are relative to it.
+    start_root : ndarray of shape (n, d_s, d_s) or None
+        Lower root of the covariance of each start; None where starts are taken as exact.
     """
 
     ds: TrajectoryDataset
@@ -36,6 +39,7 @@ class Query:
     lengths: Ints
     times: Floats
     base: Floats | None = None
+    start_root: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.start)
@@ -54,6 +58,14 @@ class Query:
     def initial_states(self) -> Floats:
         """s_start (n, d_s)."""
         return self.ds.states[self.rows]
+
+    def starts(self, copies: int, rng: np.random.Generator | None) -> Floats:
+        """Copies of s_start (copies * n, d_s), drawn from what is known of it; None: its mean."""
+        initial = np.tile(self.initial_states, (copies, 1))
+        if rng is None or self.start_root is None:
+            return initial
+        root = np.tile(self.start_root, (copies, 1, 1))
+        return initial + applied(root, rng.standard_normal(initial.shape))
 
     @property
     def initial_times(self) -> Floats:

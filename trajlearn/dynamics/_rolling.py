@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from trajlearn._sklearn import HasMethods, Interval, StrOptions
 from trajlearn.dynamics._base import TwoDoorRegressor
+from trajlearn.dynamics._cloned_policy import ClonedPolicy, clone_policy, controller
 from trajlearn.dynamics._dynamics import DynamicsEstimator
 from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES, Prediction, Request
-from trajlearn.dynamics._learner import spread
+from trajlearn.dynamics._learner import seeded, spread
+from trajlearn.dynamics._noisy_sight import Normal, independent, noisy_sight, paired
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics._rollout import (
     InputRows,
@@ -22,8 +24,10 @@ from trajlearn.dynamics._rollout import (
     filled,
     roll_out,
 )
+from trajlearn.dynamics._window import Window
 from trajlearn.dynamics.baselines import ReferenceForecaster
 from trajlearn.exceptions import MissingFieldError, MixedSamplingError
+from trajlearn.regressors.control_law import ControlLawRegressor
 from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories._layout import Layout
 from trajlearn.trajectories.times import uniform_step
@@ -33,12 +37,18 @@ __all__ = ["RollingEstimator"]
 Floats = NDArray[np.float64]
 
 
+# of the particles behind a mean
+_SIGHT_SEED = 0
+
+
 class RollingEstimator(DynamicsEstimator):
     """Estimator of the next state that is applied again and again."""
 
     inputs: str | Sequence[str]
     target: str
     policy: Any
+    policy_estimator: Any
+    policy_: Any
     rollout_actions: str
     clip_states: float | None
     n_particles: int
@@ -49,7 +59,8 @@ class RollingEstimator(DynamicsEstimator):
         "inputs": [StrOptions({"action", "params"}), "array-like"],
         "target": [StrOptions({"change", "state"})],
         "baseline": [StrOptions({"mean"}), callable, HasMethods(["predict"]), None],
-        "policy": [callable, None],
+        "policy": [callable, StrOptions({"clone"}), None],
+        "policy_estimator": [HasMethods(["fit", "predict"]), None],
         "rollout_actions": [StrOptions({"auto", "logged", "policy"})],
         "clip_states": [Interval(Real, 0, None, closed="neither"), None],
         "n_particles": [Interval(Integral, 2, None, closed="left")],
@@ -125,6 +136,55 @@ class RollingEstimator(DynamicsEstimator):
             None if groups is None else groups[episode],
         )
 
+    def _fit_episodes(
+        self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
+    ) -> None:
+        super()._fit_episodes(ds, weight, groups)
+        if hasattr(self, "policy_"):
+            del self.policy_
+        if self._clones() and "action" in self.layout_:
+            self._fit_policy(ds, weight, groups)
+
+    def _fit_policy(
+        self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
+    ) -> None:
+        """Learn the policy from episodes with the states that the controller acted on."""
+        if self._history() > 1 and self.baseline_ is not None:
+            raise ValueError(
+                f"policy='clone' with history={self._history()} and baseline={self.baseline!r}: "
+                "the past states of a roll-out are relative to the baseline, those that the "
+                "controller saw were not. Leave one of the three out."
+            )
+        estimator = self.policy_estimator
+        self.policy_ = clone_policy(
+            ds,
+            seeded(ControlLawRegressor() if estimator is None else estimator, self._rng),
+            history=self._history(),
+            pad=getattr(self.relabeler_, "pad", True),
+            timed="dt" in self.layout_,
+            weight=weight,
+            groups=groups,
+        )
+
+    def _default_policy(self) -> dict[str, Any]:
+        """Default `policy_estimator`, where one is needed."""
+        return {"policy_estimator": ControlLawRegressor()} if self._clones() else {}
+
+    def _clones(self) -> bool:
+        return isinstance(self.policy, str)
+
+    def _history(self) -> int:
+        """States that a row shows."""
+        return int(getattr(self.relabeler_, "history", 1))
+
+    def _fit_door_of_rows(self, X: Any, y: Any, sample_weight: Any, groups: Any) -> None:
+        if self._clones():
+            raise ValueError(
+                "policy='clone' needs episodes: rows do not say which of their columns the "
+                "controller saw. Fit on episodes, or give a policy= that is known."
+            )
+        super()._fit_door_of_rows(X, y, sample_weight, groups)
+
     # -- roll-outs ------------------------------------------------------------------------
 
     def _source(self, ds: TrajectoryDataset, actions: str, policy: Any) -> tuple[str, Any]:
@@ -132,6 +192,13 @@ class RollingEstimator(DynamicsEstimator):
         policy = self.policy if policy is None else policy
         if "action" not in self.layout_:
             return "none", None
+        if isinstance(policy, str):
+            if not hasattr(self, "policy_"):
+                raise ValueError(
+                    f"policy={policy!r}, but the model was fitted without: set policy='clone' and "
+                    "fit it again, or give a policy that is known."
+                )
+            policy = self.policy_
         choice = self.rollout_actions if actions == "auto" else actions
         if choice == "auto":
             choice = "logged" if policy is None else "policy"
@@ -163,7 +230,10 @@ class RollingEstimator(DynamicsEstimator):
         return not isinstance(self.baseline_, ReferenceForecaster)
 
     def _reads_logged_future(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
-        return self._source(ds, actions, policy)[0] == "logged" or "references" in self.layout_
+        source, policy = self._source(ds, actions, policy)
+        told = isinstance(policy, ClonedPolicy) and "references" in policy.blocks
+        by_policy = source == "policy" and told
+        return source == "logged" or by_policy or "references" in self.layout_
 
     def _check_time_step(self, ds: TrajectoryDataset) -> None:
         if "dt" in self.layout_ or self.dt_ is None:
@@ -179,15 +249,35 @@ class RollingEstimator(DynamicsEstimator):
     def _forecast_states(self, query: Query, request: Request) -> Prediction:
         source, policy = self._source(query.ds, request.actions, request.policy)
         self._check_time_step(query.ds)
-        prediction = self._rolled_out(query, request, self._input_rows(query, source, policy))
+        std = self._unseen_by(source)
+        sight = None if std is None else (std, independent(request.rng))
+        inputs = self._input_rows(query, source, policy, sight)
+        prediction = self._rolled_out(query, request, inputs)
+        if std is not None:
+            sight = std, paired(len(query), _SIGHT_SEED)
+            inputs = self._input_rows(query, source, policy, sight)
+            prediction.mean = self._mean_of_particles(query, inputs)
         prediction.actions = source
         return prediction
+
+    def _unseen_by(self, source: str) -> Floats | None:
+        """Standard deviation (d_s,) of what a policy sees beside the states, if there is any."""
+        return None
+
+    def _mean_of_particles(self, query: Query, inputs: InputRows) -> Floats:
+        """Mean over roll-outs that differ by what their inputs draw (n, H, d_s)."""
+        n_particles = self.n_particles + self.n_particles % 2
+        initial = np.tile(query.initial_states, (n_particles, 1))
+        step = self._step(query, n_particles, None)
+        paths = roll_out(initial, query.n_steps, inputs, step, self._limits())
+        mean: Floats = paths.reshape(n_particles, len(query), *paths.shape[1:]).mean(axis=0)
+        return mean
 
     def _rolled_out(self, query: Query, request: Request, inputs: InputRows) -> Prediction:
         """Mean by one roll-out of the mean, everything else by particles."""
 
         def paths_of(copies: int, rng: np.random.Generator | None) -> Floats:
-            initial = np.tile(query.initial_states, (copies, 1))
+            initial = query.starts(copies, rng)
             step = self._step(query, copies, rng)
             return roll_out(initial, query.n_steps, inputs, step, self._limits())
 
@@ -214,10 +304,17 @@ class RollingEstimator(DynamicsEstimator):
         width = np.ptp(self.state_range_, axis=0)
         return Limits(clip, centre, DIVERGENCE_RANGES * np.where(width > 0, width, 1.0))
 
-    def _input_rows(self, query: Query, source: str, policy: Any) -> InputRows:
+    def _input_rows(
+        self,
+        query: Query,
+        source: str,
+        policy: Any,
+        sight: tuple[Floats, Normal] | None = None,
+    ) -> InputRows:
         """Rows of inputs at each step of a roll-out; only known signals and actions enter.
 
         For any number of copies of the starts: copy i of start j is row ``i * len(query) + j``.
+        `sight` is the noise of what a policy sees, its standard deviation and how it is drawn.
         """
         ds = query.ds
         blocks: dict[str, Floats] = {}
@@ -235,17 +332,30 @@ class RollingEstimator(DynamicsEstimator):
             logged = query.future(ds.actions, steps=True)
         times = np.concatenate([query.initial_times[:, None], query.times], axis=1)
         times = filled(times)
+        if source == "policy":
+            n_told = ds.states.shape[1] if query.base is not None and self._told() else 0
+            control = controller(policy, query, theta, times, n_told)
+            if sight is not None:
+                control = noisy_sight(control, *sight)
+        window = self._window()
+        if window is not None:
+            at_start = window.before(query)
 
         def inputs(states: Floats, k: int, previous: Floats | None) -> tuple[Floats, Floats | None]:
             copies = len(states) // len(query)
             now: dict[str, Floats] = {"state": states}
+            past: dict[str, Floats] = {}
+            if window is not None:
+                # what a roll-out carries along is the window, not the last action
+                behind = np.tile(at_start, (copies, 1)) if previous is None else previous
+                past = window.blocks(behind, states)
+                now |= past
             if logged is not None:
                 blocks["action"] = logged[:, k]
             elif source == "policy":
-                by_copy = np.tile(theta[:, k], (copies, 1))
                 # the controller knows the state itself, not what it is relative to
                 base = 0.0 if query.base is None else np.tile(query.base[:, k], (copies, 1))
-                actions = policy(states + base, by_copy, np.tile(times[:, k], copies))
+                actions = control(states + base, k, past)
                 now["action"] = checked_actions(actions, self.layout_["action"], states)
             if "params" in self.layout_:
                 blocks["params"] = theta[:, k]
@@ -260,9 +370,19 @@ class RollingEstimator(DynamicsEstimator):
             if "previous" in self.layout_:
                 before = self._before(query, now["action"]) if previous is None else previous
                 now["previous"] = before
-            return self.layout_.assemble(now), now.get("action")
+            carried = now.get("action")
+            if window is not None:
+                carried = window.after(behind, states, carried)
+            return self.layout_.assemble(now), carried
 
         return inputs
+
+    def _window(self) -> Window | None:
+        """The window that a roll-out carries, if a row shows more than one state."""
+        if self._history() == 1:
+            return None
+        columns = self.layout_.columns
+        return Window(self._history(), len(columns["state"]), len(columns.get("action", ())))
 
     def _before(self, query: Query, actions: Floats) -> Floats:
         """Action before the start of each row; the first of an episode has none but itself."""

@@ -69,8 +69,11 @@ class LSTMRegressor(RollingEstimator):
         makes it a model of the tracking error. The references (for another baseline, its states)
         have to be among the inputs, as they are with ``inputs="params"``. A policy still gets
         the states themselves; `clip_states` is about the deviation.
-    policy : callable or None, default=None
-        ``policy(states (n, d_s), params (n, p), times (n,)) -> actions (n, d_a)``, for roll-outs.
+    policy : callable, "clone" or None, default=None
+        ``policy(states (n, d_s), params (n, p), times (n,)) -> actions (n, d_a)``, for roll-outs;
+        "clone" learns it from the logged actions, as in `OneStepRegressor`.
+    policy_estimator : regressor or None, default=None
+        What learns the policy from scaled rows. None: `ControlLawRegressor`.
     rollout_actions : {"auto", "logged", "policy"}, default="auto"
         "auto": the policy if there is one, else the logged actions.
     clip_states : float or None, default=None
@@ -98,6 +101,8 @@ class LSTMRegressor(RollingEstimator):
     state_range_ : ndarray of shape (2, d_s)
         Least and greatest training states.
     baseline_ : forecaster or None
+    policy_ : callable
+        The cloned policy, with ``policy="clone"``.
     n_features_in_ : int
 
     See Also
@@ -165,6 +170,7 @@ class LSTMRegressor(RollingEstimator):
         target: str = "change",
         baseline: Any = None,
         policy: Any = None,
+        policy_estimator: Any = None,
         rollout_actions: str = "auto",
         clip_states: float | None = None,
         n_particles: int = 50,
@@ -189,6 +195,7 @@ class LSTMRegressor(RollingEstimator):
         self.target = target
         self.baseline = baseline
         self.policy = policy
+        self.policy_estimator = policy_estimator
         self.rollout_actions = rollout_actions
         self.clip_states = clip_states
         self.n_particles = n_particles
@@ -205,6 +212,7 @@ class LSTMRegressor(RollingEstimator):
             "estimator": SequenceLearner(**learner),
             "relabeler": TransitionRelabeler(inputs=self.inputs),
             "scaler": BlockScaler(),
+            **self._default_policy(),
         }
 
     # -- fitting --------------------------------------------------------------------------

@@ -50,11 +50,13 @@ spread. The Gaussians are not, but a distribution that splits or folds is no Gau
 The `mean` of a forecast never depends on what else is asked for. With particles it is one
 roll-out that averages the members at every step; with "moment" and "unscented" it is the mean of
 what is propagated, which a spread may shift (for a learner without a standard deviation, the
-spread is taken to be zero). `std` comes from the particles or, with "moment" and
-"unscented", from the mean of the members' covariances and the covariance of their means.
-`samples` are whole paths, joint over time: the particles, or, with "moment" and "unscented",
-draws of a member and then, step by step, of a Gaussian given the step before. For a linear Gaussian
-system they have the distribution of the system itself.
+spread is taken to be zero). A policy that acts on noisy measurements
+(``policy_sees="measurements"``) shifts it, too: the mean is then that of particles that differ by
+what the policy sees, which are the same in every forecast. `std` comes from the particles or,
+with "moment" and "unscented", from the mean of the members' covariances and the covariance of
+their means. `samples` are whole paths, joint over time: the particles, or, with "moment" and
+"unscented", draws of a member and then, step by step, of a Gaussian given the step before. For a
+linear Gaussian system they have the distribution of the system itself.
 
 A mean that leaves 1e6 training ranges is infinite from there on; a covariance that does, or a
 particle, makes `std` infinite and leaves the mean. ``clip_states=`` clips particles, sampled paths

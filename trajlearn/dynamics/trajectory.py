@@ -229,7 +229,7 @@ class TrajectoryRegressor(DynamicsEstimator):
                 factor = weight[episode] if factor is None else factor * weight[episode]
             return self._scaled(rows), z, factor
 
-        self.estimator_.fit_stream(draw, n_rows=self.relabeler_.n_pairs(ds))
+        self.estimator_ = self.estimator_.fit_stream(draw, n_rows=self.relabeler_.n_pairs(ds))
 
     def _learn_scale(self, rows: Floats, targets: Floats, weight: Floats | None) -> None:
         """Scale of what is predicted: the state, its change, or its deviation from the baseline."""

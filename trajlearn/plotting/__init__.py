@@ -2,9 +2,9 @@
 
 `plot_forecast` shows predicted against logged states, `plot_horizon_errors` how the error grows
 with the horizon, `plot_reward_table` how well rewards are predicted,
-`plot_search` and `plot_slices` how a policy search goes and what its model believes. Each draws
-into the axes it is given, or makes a figure, and returns the axes, so that titles, limits and
-legends can be changed afterwards.
+`plot_selection` which formulation wins at which horizon, `plot_search` and `plot_slices` how a
+policy search goes and what its model believes. Each draws into the axes it is given, or makes a
+figure, and returns the axes, so that titles, limits and legends can be changed afterwards.
 """
 
 from trajlearn.plotting.calibration import plot_coverage, plot_pit, plot_reliability
@@ -13,6 +13,7 @@ from trajlearn.plotting.fan import plot_fan
 from trajlearn.plotting.forecasts import plot_forecast
 from trajlearn.plotting.rewards import plot_reward_table
 from trajlearn.plotting.search import plot_search, plot_slices
+from trajlearn.plotting.selection import plot_selection
 
 __all__ = [
     "plot_coverage",
@@ -23,5 +24,6 @@ __all__ = [
     "plot_reliability",
     "plot_reward_table",
     "plot_search",
+    "plot_selection",
     "plot_slices",
 ]

@@ -92,7 +92,14 @@ class Ensemble:
         self, batches: Iterator[Batch], settings: Settings, validation: Validation | None
     ) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
         """Train; see `trajlearn.regressors._training.train`."""
+        batches, validation = self.prepared(batches, settings, validation)
         return train(self.network, self.loss, self.optimizer, batches, settings, validation)
+
+    def prepared(
+        self, batches: Iterator[Batch], settings: Settings, validation: Validation | None
+    ) -> tuple[Iterator[Batch], Validation | None]:
+        """What training is to see of batches and held-out rows."""
+        return batches, validation
 
     def weights(self) -> list[Singles]:
         """Weights of the layers (E, in, out)."""

@@ -75,13 +75,18 @@ class BatchedMLP:
         dtype: torch.dtype,
         device: torch.device,
     ) -> None:
-        self.sizes, self.n_members = tuple(sizes), n_members
+        self.sizes, self.n_members, self.activation = tuple(sizes), n_members, activation
         self._act, self._act_back = ACTIVATIONS[activation]
         shapes = [(n_members, a, b) for a, b in pairwise(sizes)]
         self.flat_weights, self.weights, self._grad_w = _flat(shapes, dtype, device)
         shapes = [(n_members, 1, b) for b in sizes[1:]]
         self.flat_biases, self.biases, self._grad_b = _flat(shapes, dtype, device)
         self._buffers: dict[int, list[Tensor]] = {}
+
+    def layers_of(self, flat: Tensor, layers: Sequence[Tensor]) -> list[Tensor]:
+        """Views of a vector like `flat_weights` (`flat_biases`) in the shapes of the layers'."""
+        parts = flat.split([layer.numel() for layer in layers])
+        return [part.view(layer.shape) for part, layer in zip(parts, layers)]
 
     def initialise(self, generator: torch.Generator) -> None:
         """Draw weights and biases from U(-1/sqrt(in), 1/sqrt(in)), as torch's Linear does."""

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 BLOCK = 128
 # Widths are padded to whole vectors: with some odd widths (5 to 7, 9 to 11 outputs) the bits of a
 # row depend on its place in the block, and few outputs cost twice the time.
-_LANES = 16
+LANES = 16
 
 
 class Predictor:
@@ -51,8 +51,8 @@ class Predictor:
         self._weights = [_tensor(w, device) for w in weights]
         self._biases = [_tensor(b, device) for b in biases]
         for i, (weight, bias) in enumerate(zip(self._weights, self._biases)):
-            above = -weight.shape[1] % _LANES if i else 0
-            beside = -weight.shape[2] % _LANES
+            above = -weight.shape[1] % LANES if i else 0
+            beside = -weight.shape[2] % LANES
             self._weights[i] = pad(weight, (0, beside, 0, above))
             self._biases[i] = pad(bias, (0, beside))
         self._act = ACTIVATIONS[activation][0]

@@ -1,6 +1,7 @@
 """Training an ensemble on batches: what it sets beside the weights, and when it has failed."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from trajlearn.regressors._samples import Rows
 from trajlearn.regressors._training import Settings, Validation
 from trajlearn.regressors._variance import VarianceEnsemble
 
-__all__ = ["REFERENCE_ROWS", "TrainedEnsemble"]
+__all__ = ["REFERENCE_ROWS", "Curves", "TrainedEnsemble", "Training"]
 
 Floats = NDArray[np.float64]
 
@@ -29,6 +30,41 @@ _OF_VARIANCE = {
     "variance_loss_curve_",
     "_variance_moments",
 }
+
+
+# steps taken, losses and held-out losses, as `Ensemble.train` gives them
+Curves = tuple[int, Floats, Floats]
+
+
+@dataclass(frozen=True, eq=False)
+class Training:
+    """What a fit trains on, and for how long.
+
+    Attributes
+    ----------
+    batches : iterator of Batch
+    rows : Rows
+        On which the residuals are measured.
+    n_steps : int
+    rng : Generator
+    validation : Rows or None
+        Held out.
+    unseen : iterator of Batch or None
+        Of what each bootstrapped member is not trained on.
+    goes_on : bool
+        From the weights of the last fit.
+    one_pass : bool
+        At the constant rate and with the moments of the last fit, and never a failure.
+    """
+
+    batches: Iterator[Batch]
+    rows: Rows
+    n_steps: int
+    rng: np.random.Generator
+    validation: Rows | None = None
+    unseen: Iterator[Batch] | None = None
+    goes_on: bool = False
+    one_pass: bool = False
 
 
 class TrainedEnsemble(FittedEnsemble):
@@ -46,7 +82,6 @@ class TrainedEnsemble(FittedEnsemble):
     validation_loss_curve_: Floats
     variance_loss_curve_: Floats
     verbose: Any
-    warm_start: bool
     weight_decay: float
     _moments: list[NDArray[np.float32]]
     _variance_moments: list[NDArray[np.float32]]
@@ -54,29 +89,23 @@ class TrainedEnsemble(FittedEnsemble):
     def _to_tensors(self) -> ToTensors:
         return ToTensors(self.target_mean_, self.target_scale_, find_device(self.device))
 
-    def _train(
-        self,
-        batches: Iterator[Batch],
-        rows: Rows,
-        n_steps: int,
-        rng: np.random.Generator,
-        *,
-        validation: Rows | None = None,
-        unseen: Iterator[Batch] | None = None,
-        one_pass: bool = False,
-    ) -> None:
-        """Train, and measure the residuals on `rows`; then the variance, where it is separate.
+    def _train(self, training: Training) -> None:
+        """Train; then the variance, where it is separate."""
+        ensemble = self._begun(training)
+        settings, held = self._settings(training), self._held_out(training)
+        self._finish(ensemble, ensemble.train(training.batches, settings, held), training)
 
-        `unseen` are batches of what each bootstrapped member was not trained on.
-        """
-        fitted = hasattr(self, "coefs_")
-        go_on, moments = (one_pass or self.warm_start) and fitted, one_pass and fitted
-        schedule = "constant" if one_pass else self.schedule
-        settings = Settings(n_steps, self.learning_rate, schedule, verbose=bool(self.verbose))
-        held = None
-        if validation is not None:
-            tensors = self._to_tensors()(validation.X, validation.y, validation.weight)
-            held = Validation(*tensors, self.patience)
+    def _finish(self, ensemble: Ensemble, curves: Curves, training: Training) -> None:
+        """Keep trained networks; train the variance, where it is separate."""
+        settings, held = self._settings(training), self._held_out(training)
+        peak = self._take(ensemble, curves, training)
+        if self._separate():
+            variance = self._begun_variance(training, ensemble, peak)
+            curves = variance.train(training.unseen or training.batches, settings, held)
+            self._take_variance(variance, curves)
+
+    def _begun(self, training: Training) -> Ensemble:
+        """Networks that training starts from: new ones, or those of the last fit."""
         joint = self.probabilistic and not self._separate()
         ensemble = Ensemble(
             self.n_features_in_,
@@ -87,51 +116,58 @@ class TrainedEnsemble(FittedEnsemble):
             nll_beta=self.nll_beta if joint else None,
             weight_decay=self.weight_decay,
             device=find_device(self.device),
-            seed=int(rng.integers(2**62)),
+            seed=int(training.rng.integers(2**62)),
         )
-        if go_on:
+        if training.goes_on:
             bounds = self.logvar_bounds_ if joint else ensemble.bounds()
-            ensemble.resume(
-                self.coefs_, self.intercepts_, bounds, self._moments if moments else None
-            )
-        curves = ensemble.train(batches, settings, held)
+            moments = self._moments if training.one_pass else None
+            ensemble.resume(self.coefs_, self.intercepts_, bounds, moments)
+        return ensemble
+
+    def _settings(self, training: Training) -> Settings:
+        schedule = "constant" if training.one_pass else self.schedule
+        return Settings(training.n_steps, self.learning_rate, schedule, verbose=bool(self.verbose))
+
+    def _held_out(self, training: Training) -> Validation | None:
+        rows = training.validation
+        if rows is None:
+            return None
+        return Validation(*self._to_tensors()(rows.X, rows.y, rows.weight), self.patience)
+
+    def _take(self, ensemble: Ensemble, curves: Curves, training: Training) -> Floats:
+        """Keep trained networks; greatest residuals (E, n_targets), of standardised targets."""
         self.n_steps_, self.loss_curve_, self.validation_loss_curve_ = curves
         self.coefs_, self.intercepts_ = ensemble.weights(), ensemble.biases()
         self._moments = ensemble.optimizer.moments()
-        peak = self._set_residuals(rows, limit=np.inf if one_pass else _DIVERGED)
-        if self._separate():
-            variance = VarianceEnsemble(
-                ensemble.network,
-                self.activation,
-                residual_std=self.residual_std_ / self.target_scale_,
-                residual_peak=peak,
-                weight_decay=self.weight_decay,
-                seed=int(rng.integers(2**62)),
-            )
-            self._train_variance(variance, unseen or batches, settings, held, go_on, moments)
-            return
-        self.logvar_bounds_ = ensemble.bounds()
-        for name in _OF_VARIANCE & vars(self).keys():
-            delattr(self, name)
+        limit = np.inf if training.one_pass else _DIVERGED
+        peak = self._set_residuals(training.rows, limit=limit)
+        if not self._separate():
+            self.logvar_bounds_ = ensemble.bounds()
+            for name in _OF_VARIANCE & vars(self).keys():
+                delattr(self, name)
+        return peak
 
-    def _train_variance(
-        self,
-        variance: VarianceEnsemble,
-        batches: Iterator[Batch],
-        settings: Settings,
-        held_out: Validation | None,
-        go_on: bool,
-        moments: bool,
-    ) -> None:
-        """Train the networks of the variance; a mean may go on where they are new."""
-        if go_on and hasattr(self, "variance_coefs_"):
+    def _begun_variance(
+        self, training: Training, ensemble: Ensemble, peak: Floats
+    ) -> VarianceEnsemble:
+        """Networks of the variance; a mean may go on where they are new."""
+        variance = VarianceEnsemble(
+            ensemble.network,
+            self.activation,
+            residual_std=self.residual_std_ / self.target_scale_,
+            residual_peak=peak,
+            weight_decay=self.weight_decay,
+            seed=int(training.rng.integers(2**62)),
+        )
+        if training.goes_on and hasattr(self, "variance_coefs_"):
+            moments = self._variance_moments if training.one_pass else None
             variance.resume(
-                self.variance_coefs_,
-                self.variance_intercepts_,
-                self.logvar_bounds_,
-                self._variance_moments if moments else None,
+                self.variance_coefs_, self.variance_intercepts_, self.logvar_bounds_, moments
             )
-        _, self.variance_loss_curve_, _ = variance.train(batches, settings, held_out)
+        return variance
+
+    def _take_variance(self, variance: VarianceEnsemble, curves: Curves) -> None:
+        self.variance_loss_curve_ = curves[1]
         self.variance_coefs_, self.variance_intercepts_ = variance.weights(), variance.biases()
         self.logvar_bounds_ = variance.bounds()
         self._variance_moments = variance.optimizer.moments()

@@ -49,7 +49,7 @@ class Adam:
     """
 
     def __init__(self, network: BatchedMLP, loss: Loss, weight_decay: float) -> None:
-        self._decayed, self._weight_decay = network.flat_weights, weight_decay
+        self._decayed, self.weight_decay = network.flat_weights, weight_decay
         self._tensors = [network.flat_weights, network.flat_biases, *loss.parameters()]
         self._grads = [tensor.grad for tensor in self._tensors if tensor.grad is not None]
         self._first = [torch.zeros_like(tensor) for tensor in self._tensors]
@@ -58,8 +58,8 @@ class Adam:
 
     def step(self, learning_rate: float) -> None:
         """Update every tensor from its gradient."""
-        if self._weight_decay:
-            self._decayed.mul_(1.0 - learning_rate * self._weight_decay)
+        if self.weight_decay:
+            self._decayed.mul_(1.0 - learning_rate * self.weight_decay)
         adamw(
             self._tensors,
             self._grads,
@@ -79,6 +79,15 @@ class Adam:
 
     def _state(self) -> list[Tensor]:
         return [*self._steps, *self._first, *self._second]
+
+    def both_moments(self) -> tuple[list[Tensor], list[Tensor]]:
+        """First and second moments of the weights, the biases and the loss's own parameters."""
+        return self._first, self._second
+
+    def set_steps(self, other: "Adam") -> None:
+        """Take as many steps as done as another has."""
+        for own, done in zip(self._steps, other._steps):
+            own.copy_(done)
 
     def moments(self) -> list[NDArray[np.float32]]:
         """Step counts and moments of all tensors, to go on later."""

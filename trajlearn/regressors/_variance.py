@@ -107,10 +107,10 @@ class VarianceEnsemble(Ensemble):
         self._nll.low = torch.minimum(self._nll.low, low)
         self._nll.high = torch.maximum(self._nll.high, high)
 
-    def train(
+    def prepared(
         self, batches: Iterator[Batch], settings: Settings, validation: Validation | None
-    ) -> tuple[int, NDArray[np.float64], NDArray[np.float64]]:
-        """Train on batches, and held-out rows, as the means saw them."""
+    ) -> tuple[Iterator[Batch], Validation | None]:
+        """Batches, and held-out rows, with the residuals of the means for targets."""
         with threads_for(0.0):
             n_kept = max(settings.n_steps // _STEPS_A_BATCH, _LEAST_BATCHES)
             kept = [
@@ -123,7 +123,7 @@ class VarianceEnsemble(Ensemble):
                     self._residuals(x.expand(self._means.n_members, -1, -1), y) for x, y in blocks
                 ]
                 validation = replace(validation, y=torch.cat(residuals, dim=1))
-        return super().train(cycle(kept), settings, validation)
+        return cycle(kept), validation
 
     def _residuals(self, x: Tensor, y: Tensor) -> Tensor:
         return y - self._means.forward(x)

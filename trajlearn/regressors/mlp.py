@@ -26,7 +26,7 @@ from trajlearn.regressors._samples import (
     held_out,
     standardisation,
 )
-from trajlearn.regressors._trained import REFERENCE_ROWS, TrainedEnsemble
+from trajlearn.regressors._trained import REFERENCE_ROWS, TrainedEnsemble, Training
 from trajlearn.regressors._training import default_steps
 from trajlearn.regressors._variance import out_of_bag
 
@@ -226,24 +226,7 @@ class MLPEnsembleRegressor(RegressorMixin, TrainedEnsemble):
             For invalid or non-finite input, weights that are negative or all zero, groups that
             are needed and missing, an absent device, training that diverges.
         """
-        rows = self._validated(X, y, sample_weight, groups, reset=not self._goes_on())
-        rng = np.random.default_rng(self._seed())
-        validation = None
-        if self.early_stopping:
-            rows, validation = held_out(rows, self.validation_fraction, rng)
-        self._set_target_scale(rows, keep=self._goes_on())
-        counts = None
-        if self.bootstrap:
-            by = rows.groups if self.bootstrap == "group" else None
-            counts = bootstrap_counts(len(rows), by, self.n_members, rng)
-        to_tensors = self._to_tensors()
-        batches = row_batches(rows, counts, to_tensors, self.n_members, self.batch_size, rng)
-        unseen = None
-        if counts is not None:
-            left_out = out_of_bag(counts)
-            unseen = row_batches(rows, left_out, to_tensors, self.n_members, self.batch_size, rng)
-        n_steps = self._budget(len(rows))
-        self._train(batches, rows, n_steps, rng, validation=validation, unseen=unseen)
+        self._train(self._on_rows(X, y, sample_weight, groups))
         return self
 
     @fit_context(prefer_skip_nested_validation=True)
@@ -272,18 +255,7 @@ class MLPEnsembleRegressor(RegressorMixin, TrainedEnsemble):
             As in `fit`; for draws of other shapes; with `early_stopping`, `bootstrap` or
             `max_epochs`, which need fixed rows.
         """
-        self._refuse("early_stopping", "bootstrap", "max_epochs", why="fixed rows, not a stream")
-        rng = np.random.default_rng(self._seed(random_state))
-        reference = checked_draw(draw, REFERENCE_ROWS, rng)
-        rows = self._validated(*reference, reset=not self._goes_on())
-        self._set_target_scale(rows, keep=self._goes_on())
-        widths, to_tensors = (self.n_features_in_, rows.y.shape[1]), self._to_tensors()
-
-        def pool(n: int) -> Batch:
-            return to_tensors(*checked_draw(draw, n, rng, widths))
-
-        batches = stream_batches(pool, self.n_members, self.batch_size)
-        self._train(batches, rows, self._budget(n_rows or 10**9), rng)
+        self._train(self._on_stream(draw, random_state, n_rows))
         return self
 
     @fit_context(prefer_skip_nested_validation=True)
@@ -319,8 +291,47 @@ class MLPEnsembleRegressor(RegressorMixin, TrainedEnsemble):
         rng = np.random.default_rng(self._seed() + passed)
         self._set_target_scale(rows, keep=not first)
         batches = row_batches(rows, None, self._to_tensors(), self.n_members, self.batch_size, rng)
-        self._train(batches, rows, -(-len(rows) // self.batch_size), rng, one_pass=True)
+        n_steps = -(-len(rows) // self.batch_size)
+        self._train(Training(batches, rows, n_steps, rng, goes_on=not first, one_pass=True))
         return self
+
+    def _on_rows(self, X: Any, y: Any, sample_weight: Any, groups: Any) -> Training:
+        """Training on rows, as `fit` is given them."""
+        goes_on = self._goes_on()
+        rows = self._validated(X, y, sample_weight, groups, reset=not goes_on)
+        rng = np.random.default_rng(self._seed())
+        validation = None
+        if self.early_stopping:
+            rows, validation = held_out(rows, self.validation_fraction, rng)
+        self._set_target_scale(rows, keep=goes_on)
+        counts = None
+        if self.bootstrap:
+            by = rows.groups if self.bootstrap == "group" else None
+            counts = bootstrap_counts(len(rows), by, self.n_members, rng)
+        to_tensors = self._to_tensors()
+        batches = row_batches(rows, counts, to_tensors, self.n_members, self.batch_size, rng)
+        unseen = None
+        if counts is not None:
+            left_out = out_of_bag(counts)
+            unseen = row_batches(rows, left_out, to_tensors, self.n_members, self.batch_size, rng)
+        n_steps = self._budget(len(rows))
+        return Training(batches, rows, n_steps, rng, validation, unseen, goes_on)
+
+    def _on_stream(self, draw: Draw, random_state: Any, n_rows: int | None) -> Training:
+        """Training on fresh rows at every step, as `fit_stream` is given them."""
+        goes_on = self._goes_on()
+        self._refuse("early_stopping", "bootstrap", "max_epochs", why="fixed rows, not a stream")
+        rng = np.random.default_rng(self._seed(random_state))
+        reference = checked_draw(draw, REFERENCE_ROWS, rng)
+        rows = self._validated(*reference, reset=not goes_on)
+        self._set_target_scale(rows, keep=goes_on)
+        widths, to_tensors = (self.n_features_in_, rows.y.shape[1]), self._to_tensors()
+
+        def pool(n: int) -> Batch:
+            return to_tensors(*checked_draw(draw, n, rng, widths))
+
+        batches = stream_batches(pool, self.n_members, self.batch_size)
+        return Training(batches, rows, self._budget(n_rows or 10**9), rng, goes_on=goes_on)
 
     def _validated(
         self, X: Any, y: Any, sample_weight: Any, groups: Any = None, *, reset: bool

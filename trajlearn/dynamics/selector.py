@@ -1,0 +1,459 @@
+"""Forecasts by the formulation that is best at each horizon, judged on held-out episodes."""
+
+import warnings
+from collections.abc import Callable
+from numbers import Integral, Real
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from sklearn.frozen import FrozenEstimator
+from sklearn.utils import check_random_state
+from sklearn.utils.metaestimators import available_if
+from sklearn.utils.validation import check_is_fitted
+
+from trajlearn._sklearn import Interval, StrOptions, fit_context
+from trajlearn.dynamics._assessment import assess_all, common_states, held_out_folds, units_of
+from trajlearn.dynamics._conformal import steps_of
+from trajlearn.dynamics._default_members import default_members
+from trajlearn.dynamics._episode_arguments import in_groups
+from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES
+from trajlearn.dynamics._held_out_noise import HeldOutNoise, noise_of
+from trajlearn.dynamics._horizon_choice import Choice, blend, pick, step_weights
+from trajlearn.dynamics._horizon_losses import HorizonLosses
+from trajlearn.dynamics._meta import MetaForecaster
+from trajlearn.dynamics._mixed_forecast import Part, cut_after, mixed, shortened
+from trajlearn.dynamics._named_members import NamedMembers, checked_members, with_policy
+from trajlearn.dynamics._selection_evidence import ReportsSelection
+from trajlearn.dynamics._shared_states import shared_states
+from trajlearn.dynamics.distilled import DistilledForecaster
+from trajlearn.dynamics.forecast import Forecast
+from trajlearn.exceptions import DivergenceWarning
+from trajlearn.trajectories import TrajectoryDataset
+from trajlearn.trajectories._relabeler import generator
+from trajlearn.trajectories.times import median_step
+
+__all__ = ["HorizonSelector"]
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+# asks a fitted member for a forecast of so many steps, with keywords
+Asked = Callable[..., Forecast]
+
+
+def _members_can(name: str) -> Callable[[Any], bool]:
+    """Check for `available_if`: whether the members have a method; those that are chosen do."""
+
+    def check(self: "HorizonSelector") -> bool:
+        members = list(self._named().values())
+        if hasattr(self, "weights_"):
+            used = np.flatnonzero(self.weights_.any(axis=0))
+            members = [self.estimators_[i] for i in used]
+        return all(hasattr(member, name) for member in members if not isinstance(member, str))
+
+    return check
+
+
+class HorizonSelector(ReportsSelection, NamedMembers, MetaForecaster):
+    """Fits several formulations and forecasts by the one that is best at each horizon.
+
+    No formulation wins everywhere: a one-step model is ahead where the whole state is measured
+    well, a trajectory model where it is not, and which of them at which horizon, nobody knows
+    before. Here each member is fitted on some episodes and forecasts the others from their first
+    state; its squared errors by horizon, compared with the logged states, decide.
+
+    - The loss of a member on an episode at a horizon is log(1 + e / m), with e its squared error
+      in training ranges, averaged over horizons nearby, and m the geometric mean of the best
+      member's error on that episode and of its median error: one episode in which all go wrong
+      decides nothing.
+    - ``rule="pick"``: the member of least mean loss over all horizons; at a horizon where another
+      one is better by more than `margin` standard errors, paired by episode, that one.
+    - ``rule="blend"``: the pick; at a horizon where a convex combination of the `n_blended` best
+      members, that of least loss, is better than the pick by more than twice that, the
+      combination.
+
+    Parameters
+    ----------
+    estimators : list of (str, estimator) or None, default=None
+        Members by name: dynamics estimators or Pipelines that end in one, all of the same states.
+        ``"drop"`` in place of one leaves it out; one in a `FrozenEstimator` is not fitted, and
+        should not have seen the episodes. None: what suits the episodes, see `default_members`.
+    policy : callable, "clone" or None, default=None
+        Policy for all members that have a parameter `policy` and none of their own. For the
+        default members None is "clone": they learn it from the logged actions.
+    cv : int, splitter or iterable of (train, test), default=4
+        Folds of whole episodes (of groups, where there are); up to five episodes are left out one
+        by one.
+    rule : {"pick", "blend"}, default="pick"
+    margin : float, default=1.0
+        Standard errors by which another member must be better at a horizon.
+    bandwidth : float, default=0.3
+        Errors at horizons that differ by less than this in their logarithm are averaged, with
+        weights that fall from the middle on. 0 takes each step by itself.
+    n_blended : int, default=5
+        Members that "blend" combines.
+    error_score : float, default=-1e12
+        Score of a diverged episode.
+    random_state : int, RandomState or None, default=None
+    n_jobs : int or None, default=None
+        Members fitted at once, as in joblib.
+    verbose : int, default=0
+        1 shows a progress bar, 2 also those of members.
+
+    Attributes
+    ----------
+    names_ : tuple of str
+    estimators_ : list of estimator
+        Members, fitted on all episodes.
+    best_ : str
+        The member of least loss over all horizons.
+    weights_ : ndarray of shape (H, M)
+        Weight of each member at each step; of a pick one of them is 1.
+    choice_ : ndarray of shape (H,)
+        Name of the member of greatest weight at each step.
+    cv_errors_ : DataFrame
+        One row a member and horizon: ``member``, ``horizon``, ``n_episodes``, ``n_diverged``, the
+        ``median`` and ``mean`` squared error in training ranges, and the ``loss``.
+    fit_seconds_, predict_seconds_ : dict from name to float
+        Of all fits of a member, and of one forecast of all episodes.
+    state_range_ : ndarray of shape (2, d_s)
+    state_names_ : tuple of str
+    dt_ : float
+        Median time step.
+
+    Notes
+    -----
+    An episode counts at the horizons it has. A member that cannot forecast as many episodes to a
+    horizon as another (a trajectory model where theta changes on the way) is not chosen there.
+    Beyond the longest held-out episode the last choice is kept. A forecast's `actions` say where
+    its members, chosen or not, take theirs from.
+
+    `std` and `samples` are those of the mixture of members under the weights; one that has no
+    standard deviation gets the root mean square of its held-out errors at that horizon. Put a
+    `CalibratedForecaster` around the selector for intervals that hold.
+
+    Errors are measured against logged states, noise and all, which hides differences that are
+    small beside it. And the best of many on the same episodes looks better than it is: judge the
+    selector itself on episodes that it has not seen.
+
+    See Also
+    --------
+    trajlearn.evaluation.cross_validate_horizons : one estimator's errors by horizon.
+
+    References
+    ----------
+    L. Breiman, "Stacked regressions", Machine Learning 24 (1996) (convex weights by
+    cross-validation).
+    L. Breiman et al., "Classification and Regression Trees", 1984 (one standard error).
+
+    Examples
+    --------
+    A decay under known feedback is linear step by step; its end is not linear in theta:
+
+    >>> import numpy as np
+    >>> from sklearn.linear_model import LinearRegression
+    >>> from trajlearn import HorizonSelector, OneStepRegressor, TrajectoryDataset
+    >>> from trajlearn import TrajectoryRegressor
+    >>> theta = np.linspace(0.2, 1.0, 12)[:, None]
+    >>> states = np.exp(-theta * 0.1 * np.arange(41))[..., None]
+    >>> ds = TrajectoryDataset.from_arrays(states, actions=-theta[..., None] * states[:, :-1],
+    ...                                    params=theta, dt=0.1)
+    >>> model = HorizonSelector([
+    ...     ("D", OneStepRegressor(LinearRegression(), policy=lambda s, theta, t: -theta * s)),
+    ...     ("T", TrajectoryRegressor(LinearRegression())),
+    ... ], random_state=0).fit(ds)
+    >>> model.best_, model.predict(ds)
+    ('D', Forecast(n=12, H=40, d_s=1, actions='policy'))
+    """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        "estimators": [list, tuple, None],
+        "policy": [callable, StrOptions({"clone"}), None],
+        "cv": [Interval(Integral, 2, None, closed="left"), "cv_object"],
+        "rule": [StrOptions({"pick", "blend"})],
+        "margin": [Interval(Real, 0, None, closed="left")],
+        "bandwidth": [Interval(Real, 0, None, closed="left")],
+        "n_blended": [Interval(Integral, 1, 10, closed="both")],
+        "error_score": [Interval(Real, None, 0, closed="both")],
+        "random_state": ["random_state"],
+        "n_jobs": [Integral, None],
+        "verbose": ["verbose"],
+    }
+
+    def __init__(
+        self,
+        estimators: Any = None,
+        *,
+        policy: Any = None,
+        cv: Any = 4,
+        rule: str = "pick",
+        margin: float = 1.0,
+        bandwidth: float = 0.3,
+        n_blended: int = 5,
+        error_score: float = -1e12,
+        random_state: Any = None,
+        n_jobs: int | None = None,
+        verbose: int = 0,
+    ) -> None:
+        self.estimators = estimators
+        self.policy = policy
+        self.cv = cv
+        self.rule = rule
+        self.margin = margin
+        self.bandwidth = bandwidth
+        self.n_blended = n_blended
+        self.error_score = error_score
+        self.random_state = random_state
+        self.n_jobs = n_jobs
+        self.verbose = verbose
+
+    def _defaults(self) -> dict[str, Any]:
+        # the members depend on the episodes
+        return {}
+
+    # -- fitting --------------------------------------------------------------------------
+
+    @fit_context(prefer_skip_nested_validation=False)
+    def fit(self, X: Any, y: None = None, *, groups: ArrayLike | None = None) -> Self:
+        """Judge the members on held-out episodes, and fit them on all.
+
+        Parameters
+        ----------
+        X : TrajectoryDataset or list of Trajectory
+        y : None
+            Must be omitted.
+        groups : array-like of shape (n,), optional
+            Labels of episodes that are held out together. The default is ``ds.group``, else the
+            episode.
+
+        Returns
+        -------
+        self
+
+        Raises
+        ------
+        TypeError
+            If `X` is rows, or a member predicts no `Forecast`.
+        ValueError
+            If there is one episode or group only; if members forecast different states.
+        """
+        ds = in_groups(self._episodes(X, y), groups)
+        seed = check_random_state(self.random_state).randint(2**31, size=4)
+        splitting, fitting = np.random.default_rng(seed).spawn(2)
+        members = self._members(ds)
+        assessed = assess_all(
+            members,
+            ds,
+            held_out_folds(ds, self.cv, splitting),
+            fitting,
+            n_jobs=self.n_jobs,
+            verbose=self.verbose,
+        )
+        names = tuple(name for name, _ in members)
+        self.state_names_, self.state_range_ = common_states(names, assessed, ds)
+        columns, _, _ = shared_states(self.state_names_, ds)
+        low, high = self.state_range_[:, columns]
+        scaled = np.stack([a.residuals for a in assessed]) / np.where(high > low, high - low, 1.0)
+        with np.errstate(over="ignore"):
+            self._errors = (scaled**2).mean(axis=3)
+        self._units = units_of(ds)
+        losses = self._losses()
+        self.names_, self.estimators_ = names, [a.model for a in assessed]
+        choice = self._chosen(losses, scaled)
+        self.best_ = names[choice.best]
+        self.weights_ = step_weights(choice, losses, self._errors.shape[2])
+        self.choice_ = np.array(names)[self.weights_.argmax(axis=1)]
+        self.fit_seconds_ = {name: a.fit_seconds for name, a in zip(names, assessed)}
+        self.predict_seconds_ = {name: a.predict_seconds for name, a in zip(names, assessed)}
+        self.dt_ = median_step(ds)
+        self._sources = tuple(a.actions for a in assessed)
+        self._noise: list[HeldOutNoise | None] = [
+            None if a.gives_std else noise_of(a, self.state_range_, columns, self.bandwidth)
+            for a in assessed
+        ]
+        elapsed = np.concatenate([a.elapsed for a in assessed])
+        self._elapsed: Floats = np.maximum.accumulate(np.nanmedian(elapsed, axis=0))
+        return self
+
+    def _members(self, ds: TrajectoryDataset) -> list[tuple[str, Any]]:
+        if self.estimators is None:
+            return default_members(ds, policy=self.policy)
+        taken = set(self.get_params(deep=False))
+        given = checked_members(self.estimators, taken)
+        return [(name, with_policy(member, self.policy)) for name, member in given]
+
+    def _chosen(self, losses: HorizonLosses, residuals: Floats) -> Choice:
+        if self.rule == "pick":
+            return pick(losses, self.margin)
+        # as in the losses, who has diverged is this far off
+        finite = np.clip(residuals, -DIVERGENCE_RANGES, DIVERGENCE_RANGES)
+        return blend(losses, finite, self.margin, self.n_blended, self.bandwidth)
+
+    # -- prediction -----------------------------------------------------------------------
+
+    def predict(
+        self,
+        X: Any,
+        return_std: bool = False,
+        *,
+        start: ArrayLike = 0,
+        horizon: int | None = None,
+        actions: str = "auto",
+        policy: Any = None,
+        n_samples: int | None = None,
+        random_state: Any = None,
+    ) -> Forecast:
+        """Forecast episodes; each member once, to the longest horizon at which it has weight.
+
+        Parameters
+        ----------
+        X : TrajectoryDataset or list of Trajectory
+        return_std : bool, default=False
+        start, horizon, actions, policy, n_samples, random_state
+            As in `forecast` of the members.
+
+        Returns
+        -------
+        Forecast
+        """
+        check_is_fitted(self, "weights_")
+        ds = self._episodes(X)
+        n_steps = int(ds.lengths.max())
+        # members refuse a horizon that is none
+        if isinstance(horizon, (int, np.integer)) and horizon > 0:
+            n_steps = int(horizon)
+
+        def ask(member: Any, reach: int, **settings: Any) -> Forecast:
+            of, to = ds, horizon
+            if reach < n_steps and horizon is None:
+                of = cut_after(ds, start, reach)
+            elif reach < n_steps:
+                to = reach
+            return member.predict(
+                of, start=start, horizon=to, actions=actions, policy=policy, **settings
+            )
+
+        found = self._mixture(np.arange(n_steps), ask, return_std, n_samples, random_state)
+        source = self._source(found, actions, policy)
+        if source == "logged":
+            episode = np.arange(len(ds)) if found.episode is None else found.episode
+            found = shortened(found, ds.lengths[episode] - found.start)
+        return self._ranged(found._replace(actions=source))
+
+    @available_if(_members_can("predict_trajectory"))
+    def predict_trajectory(
+        self,
+        initial_states: ArrayLike,
+        *,
+        horizons: ArrayLike,
+        return_std: bool = False,
+        n_samples: int | None = None,
+        random_state: Any = None,
+        **signals: Any,
+    ) -> Forecast:
+        """Predict from states and known signals alone, without a dataset: for planning.
+
+        Parameters
+        ----------
+        initial_states : array-like of shape (n, d_s) or (d_s,)
+        horizons : array-like of shape (H,)
+            Times after the start. Who predicts each is chosen as at the next step at or after it.
+        return_std, n_samples, random_state
+            As in `predict`.
+        **signals
+            As in `predict_trajectory` of the members; they must agree on arrays by step.
+
+        Returns
+        -------
+        Forecast
+        """
+        check_is_fitted(self, "weights_")
+        wanted = np.atleast_1d(np.asarray(horizons, dtype=np.float64))
+        # arrays by step have as many rows as there are steps to the last horizon
+        whole = any(
+            signals.get(name) is not None and not callable(signals[name])
+            for name in ("actions", "references")
+        )
+
+        def ask(member: Any, reach: int, **settings: Any) -> Forecast:
+            some = wanted if whole else wanted[:reach]
+            return member.predict_trajectory(initial_states, horizons=some, **settings, **signals)
+
+        steps = steps_of(wanted, self._elapsed)
+        found = self._mixture(steps, ask, return_std, n_samples, random_state)
+        given = "auto" if signals.get("actions") is None else "logged"
+        source = self._source(found, given, signals.get("policy"))
+        return self._ranged(found._replace(actions=source))
+
+    def _mixture(
+        self, steps: Ints, ask: Asked, return_std: bool, n_samples: int | None, random_state: Any
+    ) -> Forecast:
+        """Mixture of the members that have weight at some of the steps (H,), counted from 0."""
+        weights = self.weights_[np.minimum(steps, len(self.weights_) - 1)]
+        rng = np.random.default_rng() if random_state is None else generator(random_state)
+        seeds = rng.integers(2**31, size=len(self.names_))
+        parts = []
+        for i in np.flatnonzero((weights > 0).any(axis=0)):
+            noise = self._noise[i]
+            settings: dict[str, Any] = {}
+            if random_state is not None or n_samples:
+                settings["random_state"] = int(seeds[i])
+            if noise is None:
+                settings |= {"return_std": return_std, "n_samples": n_samples}
+            reach = int(np.flatnonzero(weights[:, i])[-1]) + 1
+            with warnings.catch_warnings():
+                # told once for all members, below
+                warnings.simplefilter("ignore", DivergenceWarning)
+                found = ask(self.estimators_[i], reach, **settings)
+            parts.append(Part(found, weights[:, i], noise, steps))
+        forecast = mixed(parts, return_std=return_std, n_samples=n_samples, rng=rng)
+        if forecast.diverged_at.any():
+            gone = forecast.diverged_at[forecast.diverged_at > 0]
+            warnings.warn(
+                f"{len(gone)} of {len(forecast)} forecasts diverged (first at step {gone.min()}): "
+                "their states are inf from there on. report('member') says who diverged on "
+                "held-out episodes; clip_states= of one-step members bounds them.",
+                DivergenceWarning,
+                stacklevel=4,
+            )
+        return forecast
+
+    def _source(self, found: Forecast, actions: str, policy: Any) -> str:
+        """Where members take actions from, chosen ones or not: the same for all horizons."""
+        if set(self._sources) == {"none"}:
+            return "none"
+        if actions == "auto" and policy is None:
+            return "logged" if "logged" in self._sources else "policy"
+        if found.actions != "none":
+            return found.actions
+        return "policy" if actions == "auto" else actions
+
+    def _ends_with_log(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
+        asked = [getattr(member, "_ends_with_log", None) for member in self.estimators_]
+        return any(ends is not None and ends(ds, actions, policy) for ends in asked)
+
+    def distill(
+        self, X: Any, student: Any = None, *, random_state: Any = None, **settings: Any
+    ) -> DistilledForecaster:
+        """Teach one trajectory model what the selector forecasts: any horizon in one evaluation.
+
+        Parameters
+        ----------
+        X : TrajectoryDataset or list of Trajectory
+            With params; what the student learns from beside what the selector imagines.
+        student : dynamics estimator or None, default=None
+            None is `TrajectoryRegressor()`.
+        random_state : int, RandomState or None, default=None
+        **settings
+            Further parameters of `DistilledForecaster`, such as ``param_bounds=``.
+
+        Returns
+        -------
+        DistilledForecaster
+            Fitted. ``fidelity(others)`` measures, by horizon and on episodes that neither has
+            seen, what was lost.
+        """
+        check_is_fitted(self, "weights_")
+        teacher = FrozenEstimator(self)
+        distilled = DistilledForecaster(teacher, student, random_state=random_state, **settings)
+        return distilled.fit(X)
