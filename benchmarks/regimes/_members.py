@@ -3,6 +3,7 @@
 import time
 from typing import Any
 
+import joblib
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
@@ -18,6 +19,7 @@ from trajlearn.dynamics._default_members import default_members
 from trajlearn.dynamics._joint_folds import fit_folds
 from trajlearn.dynamics.selector import HorizonSelector
 from trajlearn.regressors import polynomial
+from trajlearn.regressors.control_law import ControlLawRegressor
 
 Ints = NDArray[np.intp]
 Members = list[tuple[str, Any]]
@@ -31,21 +33,31 @@ QUICK = ("poly1", "poly3", "poly1_em", "poly3_em", "network", "C", "T")
 _WINDOW = 5
 
 
-def members_of(regime: Regime, ds: TrajectoryDataset, mode: str) -> Members:
+def members_of(regime: Regime, ds: TrajectoryDataset, policy: Any, mode: str) -> Members:
     """The selector's default members, and those that the regime calls for.
 
-    All with a cloned policy: it costs next to nothing, and a known one can take its place in any
-    forecast, so that one fit serves both.
+    With a cloned policy if there is to be one: the known one can take its place in any forecast,
+    so that one fit serves both.
     """
-    members = default_members(ds, policy="clone")
+    if "unknown" in regime.policies:
+        policy = "clone"
+    members = default_members(ds, policy=policy)
     if regime.states:
         members += [
-            (f"{name}_window", _one_step(learner, history=_WINDOW))
+            (f"{name}_window", _one_step(learner, policy, history=_WINDOW))
             for name, learner in (("poly1", polynomial(degree=1)), ("network", None))
+        ]
+        members += [
+            (f"poly{k}_latent", _one_step(polynomial(degree=k), policy, latent_velocities=True))
+            for k in (1, 3)
         ]
     if regime.acts_on_noise:
         sees = {"denoise": "em", "policy_sees": "measurements"}
-        members.append(("poly1_em_sees", _one_step(polynomial(degree=1), **sees)))
+        members.append(("poly1_em_sees", _one_step(polynomial(degree=1), policy, **sees)))
+    laws = Laws()
+    for _, model in members:
+        if getattr(model, "policy", None) == "clone":
+            model.set_params(policy_estimator=OnceFitted(laws))
     if mode == "quick":
         members = [(name, model) for name, model in members if name in QUICK]
         for name, model in members:
@@ -54,8 +66,35 @@ def members_of(regime: Regime, ds: TrajectoryDataset, mode: str) -> Members:
     return members
 
 
-def _one_step(learner: Any, **settings: Any) -> OneStepRegressor:
-    return OneStepRegressor(learner, policy="clone", clip_states=1.2, **settings)
+def _one_step(learner: Any, policy: Any, **settings: Any) -> OneStepRegressor:
+    return OneStepRegressor(learner, policy=policy, clip_states=1.2, **settings)
+
+
+class Laws(dict[str, ControlLawRegressor]):
+    """Controllers that were learned, by what from; copies of estimators share it."""
+
+    def __deepcopy__(self, memo: Any) -> "Laws":
+        return self
+
+
+class OnceFitted(ControlLawRegressor):
+    """The default learner of a policy, which fits the same rows once for all members."""
+
+    def __init__(self, laws: Laws, *, random_state: int = 0) -> None:
+        super().__init__(random_state=random_state)
+        self.laws = laws
+
+    def fit(
+        self, X: Any, y: Any, *, sample_weight: Any = None, groups: Any = None, gains: Any = None
+    ) -> "OnceFitted":
+        """Fit, or take over what was fitted."""
+        given = {"sample_weight": sample_weight, "groups": groups, "gains": gains}
+        key = joblib.hash((X, y, given, self.random_state))
+        if key not in self.laws:
+            law = ControlLawRegressor(random_state=self.random_state)
+            self.laws[key] = law.fit(X, y, **given)
+        vars(self).update(vars(self.laws[key]))
+        return self
 
 
 class HeldOut(BaseEstimator):
@@ -122,7 +161,7 @@ def cell(system: str, regime: str, mode: str, seed: int) -> dict[str, Any]:
     folds = folds_of(data.train, seed)
     rng = np.random.default_rng([seed, 11])
     fitted, seconds, noise = {}, {}, {}
-    for name, member in members_of(what, data.train, mode):
+    for name, member in members_of(what, data.train, data.policy, mode):
         began = time.process_time()
         with expected_warnings():
             fitted[name] = fit_folds(member, data.train, folds, rng=rng)

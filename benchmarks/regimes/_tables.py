@@ -113,7 +113,9 @@ def ratios(models: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
                 against = against[best, np.arange(len(best))]
                 logs.append(_log_ratio(judged_on[rule], against))
             over = np.exp(np.mean(logs, axis=0))
-            low, q25, middle, q75, high = np.quantile(over, [0.0, 0.25, 0.5, 0.75, 1.0])
+            # without interpolation, which infinity spoils
+            levels = [0.0, 0.25, 0.5, 0.75, 1.0]
+            low, q25, middle, q75, high = np.quantile(over, levels, method="inverted_cdf")
             spread = {"least": low, "q25": q25, "middle": middle, "q75": q75, "worst": high}
             lines.append({"rule": rule, "statistic": statistic} | spread)
     return lines
