@@ -135,6 +135,18 @@ def test_a_learner_that_misses_something_is_not_noise():
     assert not denoised(polynomial(1), inputs="params").fit(ds).noisy_
 
 
+@pytest.mark.parametrize("value", [0.0, 1.5])
+@pytest.mark.parametrize("learner", [None, SMALL_NETWORK], ids=["linear", "network"])
+def test_a_state_that_never_changes_does_no_harm(value, learner):
+    states = [np.column_stack([e.states, np.full(e.length + 1, value)]) for e in MEASURED]
+    ds = TrajectoryDataset.from_arrays(states, actions=[e.actions for e in MEASURED])
+    model = denoised(learner).fit(ds)
+    np.testing.assert_allclose(model.measurement_noise_[:2], STD, rtol=0.06)
+    assert model.measurement_noise_[2] < 1e-6
+    assert (model.smooth(ds).states[:, 2] == value).all()
+    assert np.isfinite(model.predict(ds[:1], return_std=True, start=5, random_state=0).std).all()
+
+
 def test_another_fit_without_it_forgets_the_noise(model):
     again = clone(model).fit(MEASURED).set_params(denoise=None).fit(MEASURED)
     assert not hasattr(again, "noise_")
@@ -350,5 +362,10 @@ def test_rows_are_refused():
 
 def test_history_without_actions_is_refused(model):
     silent = TrajectoryDataset.from_arrays([e.states for e in MEASURED])
-    with pytest.raises(MissingFieldError, match="no actions"):
+    with pytest.raises(MissingFieldError, match="actions before it"):
         model.predict(silent, start=5, policy=lambda s, p, t: s[:, :1])
+    wide = TrajectoryDataset.from_arrays(
+        [e.states for e in MEASURED], actions=[np.tile(e.actions, 2) for e in MEASURED]
+    )
+    with pytest.raises(ValueError, match="have 2 actions, the model was fitted on 1"):
+        model.predict(wide, start=5, policy=lambda s, p, t: s[:, :1])

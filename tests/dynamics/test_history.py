@@ -179,6 +179,8 @@ def test_what_cannot_work_is_refused():
         model(2, denoise="em").fit(train)
     with pytest.raises(ValueError, match='"previous"'):
         model(2, inputs=("action", "previous")).fit(train)
+    with pytest.raises(ValueError, match='only where "action" is an input'):
+        model(2, inputs=("params", "past_actions")).fit(masses())
     with pytest.raises(ValueError, match="needs history="):
         model(1, inputs=("action", "past_states")).fit(train)
     without = TrajectoryDataset.from_arrays(train.states.reshape(20, 31, 1), params=train.params)

@@ -1,11 +1,13 @@
 """Velocities that nobody logged: found with the step, and with it forecasts of positions."""
 
+import warnings
+
 import numpy as np
 import pytest
 from sklearn.base import clone
 
 from tests.dynamics.noisy_systems import oscillators
-from trajlearn import OneStepRegressor, TrajectoryDataset
+from trajlearn import KalmanSmoother, OneStepRegressor, TrajectoryDataset
 from trajlearn.dynamics._latent_velocities import guessed_velocities, with_velocities
 from trajlearn.exceptions import MissingFieldError
 from trajlearn.regressors import polynomial
@@ -125,6 +127,76 @@ def test_a_fit_on_smoothed_episodes_is_of_positions_too(model):
     )
 
 
+def test_positions_that_were_smoothed_before_get_velocities_too(model):
+    smoothed = KalmanSmoother().fit_transform(oscillators(noise=NOISE)[0])
+    assert smoothed.hindsight
+    assert model.smooth(smoothed).state_names == ("x", "d_x")
+    cloned = latent(policy="clone").fit(smoothed)
+    # the velocity counts, which a clone of positions would not know
+    ahead = cloned.policy_(np.array([[0.3, 0.0], [0.3, -0.2]]), [[2.0, 1.0]] * 2, [0.0, 0.0])
+    assert ahead[1, 0] - ahead[0, 0] == pytest.approx(0.2, abs=0.1)
+
+
+def test_a_position_that_never_changes_does_no_harm():
+    ds, _ = oscillators(10, noise=NOISE)
+    still = TrajectoryDataset.from_arrays(
+        [np.column_stack([e.states, np.ones(e.length + 1)]) for e in ds],
+        actions=[e.actions for e in ds],
+        dt=0.1,
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        model = latent(rollout_actions="logged", policy=None).fit(still)
+    assert model.noisy_
+    assert model.measurement_noise_[0] == pytest.approx(NOISE, rel=0.2)
+    np.testing.assert_allclose(model.smooth(still).states[:, [1, 3]], [[1.0, 0.0]] * 610, atol=1e-9)
+    np.testing.assert_allclose(model.predict(still, start=5).mean[..., 1], 1.0, atol=1e-3)
+
+
+def test_of_two_positions_both_are_forecast_from_filtered_starts():
+    rng = np.random.default_rng(0)
+    pushes = rng.normal(size=(20, 30, 2))
+    x, v = np.empty((20, 31, 2)), np.zeros((20, 2))
+    x[:, 0] = rng.normal(size=(20, 2))
+    for t in range(30):
+        x[:, t + 1] = x[:, t] + 0.1 * v
+        # a spring between them, and one to the wall
+        v = v + 0.1 * (pushes[:, t] - 2.0 * x[:, t] + x[:, t, ::-1])
+    ds = TrajectoryDataset.from_arrays(x, actions=pushes, dt=0.1)
+    model = OneStepRegressor(polynomial(1), latent_velocities=True, random_state=0).fit(ds[:15])
+    np.testing.assert_allclose(model.predict(ds[15:], start=5).mean, x[15:, 6:], atol=0.01)
+
+
+@pytest.mark.parametrize("noise", [0.0, NOISE])
+def test_velocities_of_an_exactly_sampled_plant_are_found(noise):
+    # differences of its positions are not its velocities, as they are after a step of Euler's
+    frequency, dt, rng = 2.0, 0.1, np.random.default_rng(0)
+    c, s = np.cos(frequency * dt), np.sin(frequency * dt)
+    step = np.array([[c, s / frequency], [-frequency * s, c]])
+    pushed = np.array([(1 - c) / frequency**2, s / frequency])
+    actions = rng.normal(size=(40, 60, 1))
+    states = np.empty((40, 61, 2))
+    states[:, 0] = rng.normal(size=(40, 2))
+    for t in range(60):
+        states[:, t + 1] = states[:, t] @ step.T + pushed * actions[:, t]
+    seen = states[..., :1] + noise * rng.normal(size=(40, 61, 1))
+    ds = TrajectoryDataset.from_arrays(seen, actions=actions, dt=dt)
+    model = OneStepRegressor(polynomial(1), latent_velocities=True, random_state=0).fit(ds[:20])
+    assert model.noisy_ == bool(noise)
+    found = model.smooth(ds[:20]).states[:, 1]
+    # from noisy positions its scale is not known as well as the rest
+    assert np.corrcoef(found, states[:20, :, 1].ravel())[0, 1] > (0.995 if noise else 0.9999)
+    ahead = model.predict(ds[20:], start=10, horizon=20, actions="logged").mean[..., 0]
+    error = np.sqrt(np.mean((ahead - states[20:, 11:31, 0]) ** 2))
+    assert error < (0.03 if noise else 0.01)  # of 0.6
+
+
+def test_what_is_set_after_a_fit_changes_no_fitted_step(model):
+    again = clone(model).fit(POSITIONS[:10]).set_params(latent_velocities=False)
+    assert again.predict(POSITIONS[:2], start=3).mean.shape == (2, 57, 1)
+    assert again.smooth(POSITIONS[:2]).state_names == ("x", "d_x")
+
+
 def test_guesses_are_differences_within_episodes():
     ds = TrajectoryDataset.from_arrays(
         [[[0.0], [1.0], [4.0]], [[5.0], [3.0]]], times=[[0.0, 1.0, 2.0], [0.0, 0.5]]
@@ -146,11 +218,23 @@ def test_guesses_are_differences_within_episodes():
         ({"baseline": "mean", "inputs": "params"}, {}, "knows no velocities"),
         ({"history": 3}, {}, "history=3"),
         ({}, {"sample_weight": np.ones(20)}, "latent_velocities=True takes all"),
+        # the log does not tell which velocities the controller acted on
+        ({"policy_sees": "measurements"}, {}, "which velocities the controller acted on"),
     ],
 )
 def test_what_cannot_be_is_refused(settings, fit, message):
     with pytest.raises(ValueError, match=message):
         latent(**settings).fit(POSITIONS, **fit)
+
+
+def test_velocities_among_the_states_are_refused():
+    with pytest.raises(ValueError, match="the states have d_x beside x"):
+        latent().fit(latent().fit(POSITIONS[:10]).smooth(POSITIONS[:10]))
+
+
+def test_single_steps_are_refused():
+    with pytest.raises(ValueError, match="two steps or more"):
+        latent().fit(POSITIONS.truncate(1))
 
 
 def test_rows_are_refused_and_actions_are_needed():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from sklearn.exceptions import NotFittedError
 from sklearn.linear_model import LinearRegression
 
 from tests.dynamics.systems import A, B, gain_policy
@@ -144,3 +145,14 @@ def test_gaussians_cannot_carry_it(propagation):
 def test_measurements_need_to_be_denoised():
     with pytest.raises(ValueError, match='set denoise="em"'):
         OneStepRegressor(LinearRegression(), policy_sees="measurements").fit(controlled()[1])
+    with pytest.raises(ValueError, match='set denoise="em"'):
+        OneStepRegressor(policy_sees="measurements").fit(np.zeros((9, 3)), np.zeros((9, 2)))
+
+
+def test_set_after_a_fit_without_noise_it_is_refused():
+    true, seen = controlled()
+    fitted = OneStepRegressor(LinearRegression(), policy=limited).fit(seen)
+    with pytest.raises(ValueError, match='set denoise="em"'):
+        fitted.set_params(policy_sees="measurements").predict(true)
+    with pytest.raises(NotFittedError, match="fit"):
+        fitted.set_params(denoise="em").predict(true)

@@ -36,7 +36,9 @@ EARLY, LATE = Off(0.0, 0.2), Off(0.2, 0.0)
 
 def selector(*members, **settings):
     names = [f"m{i}" for i in range(len(members))]
-    return HorizonSelector(list(zip(names, members)), **{"random_state": 0, **settings})
+    # all members are judged by all episodes; tests/dynamics/test_race.py is about the race
+    settings = {"random_state": 0, "race": False, **settings}
+    return HorizonSelector(list(zip(names, members)), **settings)
 
 
 def law(ds, steps=40):
@@ -436,7 +438,8 @@ def test_progress_is_shown_if_asked_for(capsys):
     selector(EARLY, LATE, verbose=1).fit(decays(6))
     shown = capsys.readouterr().err
     assert "members" in shown
-    assert "2/2" in shown
+    assert "2 of 2 members, folds 1-4 and all" in shown
+    assert "10/10" in shown
 
 
 def test_pickled_and_saved(tmp_path):

@@ -1,69 +1,29 @@
 """What each of several forecasters shows on episodes that it was not fitted on."""
 
-import time
 import warnings
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from numbers import Integral
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import NDArray
-from sklearn.frozen import FrozenEstimator
 from sklearn.model_selection import GroupKFold, check_cv
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from trajlearn.dynamics._joint_folds import fit_folds
+from trajlearn.dynamics._entrant import Assessment, Entrant, Fold, Ints, judged
+from trajlearn.dynamics._horizon_losses import horizon_losses
+from trajlearn.dynamics._race import enough_to_race, in_the_race
+from trajlearn.dynamics._shared_policies import SharedPolicies
 from trajlearn.dynamics._shared_states import shared_states
-from trajlearn.dynamics.forecast import Forecast
-from trajlearn.exceptions import DivergenceWarning, HorizonWarning
-from trajlearn.regressors._threads import threads_for
+from trajlearn.regressors._threads import by_workers
 from trajlearn.trajectories import TrajectoryDataset
 
-__all__ = ["Assessment", "assess_all", "common_states", "held_out_folds", "units_of"]
+__all__ = ["assess_all", "errors_in_ranges", "held_out_folds", "states_of", "units_of"]
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
-Fold = tuple[Ints, Ints]
-
 # so few episodes (groups) are left out one by one
 _FEW = 5
-
-
-@dataclass(frozen=True, eq=False)
-class Assessment:
-    """A member, and its forecasts of held-out episodes.
-
-    Attributes
-    ----------
-    model : estimator
-        Fitted on all episodes.
-    residuals : ndarray of shape (n, H, k)
-        Logged minus forecast states, of the states that are logged; NaN where there is nothing
-        to compare, inf from a divergence on.
-    elapsed : ndarray of shape (n, H)
-        Time from the start to each step; NaN likewise.
-    state_names : tuple of str
-    state_range : ndarray of shape (2, d_s)
-    actions : {"none", "logged", "policy"}
-        Where the forecasts took actions from.
-    gives_std : bool
-        Whether the model gives a standard deviation and samples.
-    fit_seconds, predict_seconds : float
-        Of all fits, and of forecasting all held-out episodes.
-    """
-
-    model: Any
-    residuals: Floats
-    elapsed: Floats
-    state_names: tuple[str, ...]
-    state_range: Floats
-    actions: str
-    gives_std: bool
-    fit_seconds: float
-    predict_seconds: float
 
 
 def units_of(ds: TrajectoryDataset) -> Ints:
@@ -86,7 +46,10 @@ def held_out_folds(ds: TrajectoryDataset, cv: Any, rng: np.random.Generator) -> 
         what = "episode" if ds.group is None else "group"
         raise ValueError(
             f"members are judged by {what}s that they were not fitted on, and there is only one "
-            f"{what}: give more, or fit the member of your choice by itself."
+            f"{what}: give more, or fit the member of your choice by itself. A "
+            f"CalibratedForecaster around a selector holds out {what}s of its own first: give it "
+            "three or more, or calibrate a fitted selector, "
+            "CalibratedForecaster(FrozenEstimator(selector)), on others."
         )
     splitter = cv
     if isinstance(cv, Integral):
@@ -111,22 +74,60 @@ def assess_all(
     folds: list[Fold],
     rng: np.random.Generator,
     *,
+    bandwidth: float,
+    n_kept: int | None,
     n_jobs: int | None,
     verbose: int,
 ) -> list[Assessment]:
-    """Assessment of each member, in their order; each has a stream of random numbers of its own."""
-    parallel = effective_n_jobs(n_jobs) > 1
-    jobs = [
-        delayed(_assess)(name, member, ds, folds, own, parallel, max(verbose - 1, 0))
-        for (name, member), own in zip(members, rng.spawn(len(members)))
-    ]
-    found: Iterator[Assessment] = Parallel(n_jobs=n_jobs, return_as="generator")(jobs)
-    with tqdm(total=len(members), desc="members", disable=not verbose) as bar:
-        assessed = []
-        for name, _ in members:
-            bar.set_postfix_str(name)
-            assessed.append(next(found))
-            bar.update()
+    """Assessment of each member, in their order; each has a stream of random numbers of its own.
+
+    Parameters
+    ----------
+    members : list of (str, estimator)
+    ds : TrajectoryDataset
+    folds : list of (train, test)
+    rng : Generator
+    bandwidth : float
+        Of the losses.
+    n_kept : int or None
+        None: all are judged by all folds. Otherwise they race: after the first and the second
+        fold those leave that are surely behind, but for the best `n_kept`, and for the frozen
+        ones, which cost little.
+    n_jobs : int or None
+    verbose : int
+    """
+    *own, of_policies = rng.spawn(len(members) + 1)
+    entrants = [Entrant(name, m, ds, folds, r) for (name, m), r in zip(members, own)]
+    shared = SharedPolicies(members, ds, folds, of_policies, n_jobs)
+    units, n_folds = units_of(ds), len(folds)
+    # what the first and the second fold say decides who goes on; the rest is trained together
+    alone = 0 if n_kept is None else min(n_folds - 1, 2)
+    heats = [*(range(k, k + 1) for k in range(alone)), range(alone, n_folds)]
+    racing = list(range(len(members)))
+    with tqdm(total=len(members) * (n_folds + 1), disable=not verbose, unit="fit") as bar:
+        for which in heats:
+            last = which[-1] == n_folds - 1
+            fits = [*which, n_folds] if last else which
+            bar.set_description(_told(len(racing), len(members), which, last))
+            shared.learn([members[i][0] for i in racing], fits)
+            jobs = [
+                (entrants[i], which, last, shared.of(members[i][0]), max(verbose - 1, 0))
+                for i in racing
+            ]
+            for i, entrant in zip(racing, by_workers(judged, jobs, n_jobs)):
+                entrants[i] = entrant
+                bar.set_postfix_str(f"{entrant.name} done")
+                bar.update(len(fits))
+            seen = np.concatenate([folds[k][1] for k in range(which[-1] + 1)])
+            if n_kept is None or last or not enough_to_race(units[seen]):
+                continue
+            some = [entrants[i] for i in racing]
+            errors = errors_in_ranges([entrant.assessment() for entrant in some], ds)[1]
+            stays = in_the_race(horizon_losses(errors, units, bandwidth), n_kept)
+            stays |= [entrant.frozen for entrant in some]
+            racing = [i for i, stay in zip(racing, stays) if stay]
+            bar.total -= int((~stays).sum()) * (n_folds - which[-1])
+    assessed = [entrant.assessment(shared.seconds(entrant.name)) for entrant in entrants]
     # nothing is known of steps that no held-out episode reaches
     known = np.any([~np.isnan(a.residuals).all(axis=(0, 2)) for a in assessed], axis=0)
     n_steps = int(np.flatnonzero(known)[-1]) + 1
@@ -136,96 +137,16 @@ def assess_all(
     ]
 
 
-def _assess(
-    name: str,
-    member: Any,
-    ds: TrajectoryDataset,
-    folds: list[Fold],
-    rng: np.random.Generator,
-    parallel: bool,
-    verbose: int,
-) -> Assessment:
-    try:
-        if not parallel:
-            return _assessed(member, ds, folds, rng, verbose)
-        # workers with several threads each would wait for one another
-        with threadpool_limits(limits=1), threads_for(0):
-            return _assessed(member, ds, folds, rng, verbose)
-    except Exception as error:
-        error.add_note(f"This happened to the member {name!r} of a HorizonSelector.")
-        raise
+def _told(n_racing: int, n_members: int, which: Sequence[int], last: bool) -> str:
+    """What a progress bar says."""
+    folds = f"folds {which[0] + 1}-{which[-1] + 1}" if len(which) > 1 else f"fold {which[0] + 1}"
+    return f"{n_racing} of {n_members} members, {folds}{' and all episodes' if last else ''}"
 
 
-def _assessed(
-    member: Any, ds: TrajectoryDataset, folds: list[Fold], rng: np.random.Generator, verbose: int
-) -> Assessment:
-    began = time.perf_counter()
-    models, model = _fitted(member, ds, folds, rng, verbose)
-    fitted = time.perf_counter()
-    seed = int(rng.integers(2**31))
-    n_steps = int(ds.lengths.max())
-    residuals, elapsed = None, np.full((len(ds), n_steps), np.nan)
-    for one, (_, test) in zip(models, folds):
-        forecast = _forecast(one, ds[test], seed)
-        missed = forecast.residuals(ds[test])
-        if residuals is None:
-            residuals = np.full((len(ds), n_steps, missed.shape[2]), np.nan)
-        steps = missed.shape[1]
-        residuals[test, :steps] = missed
-        elapsed[test, :steps] = forecast.times - forecast.initial_times[:, None]
-    assert residuals is not None  # there are folds
-    predicted = time.perf_counter()
-    return Assessment(
-        model,
-        residuals,
-        elapsed,
-        forecast.state_names,
-        forecast.state_range,
-        forecast.actions,
-        _gives_std(model, ds),
-        fitted - began,
-        predicted - fitted,
-    )
-
-
-def _fitted(
-    member: Any, ds: TrajectoryDataset, folds: list[Fold], rng: np.random.Generator, verbose: int
-) -> tuple[list[Any], Any]:
-    """The models of the folds, and that of all episodes."""
-    if isinstance(member, FrozenEstimator):
-        return [member] * len(folds), member
-    return fit_folds(member, ds, folds, rng=rng, verbose=verbose)
-
-
-def _forecast(model: Any, ds: TrajectoryDataset, seed: int) -> Forecast:
-    with warnings.catch_warnings():
-        # who diverges is not chosen, and the report says who did
-        for category in (DivergenceWarning, HorizonWarning):
-            warnings.simplefilter("ignore", category)
-        found = model.predict(ds, random_state=seed)
-    if not isinstance(found, Forecast):
-        raise TypeError(
-            f"{type(model).__name__} predicts {type(found).__name__}, not a Forecast: give "
-            "dynamics estimators, or Pipelines that end in one."
-        )
-    return found
-
-
-def _gives_std(model: Any, ds: TrajectoryDataset) -> bool:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            found = model.predict(ds[:1], return_std=True, horizon=1, n_samples=2, random_state=0)
-        except (TypeError, ValueError):
-            # those written elsewhere say so in their own ways; whatever else is wrong comes again
-            return False
-    return found.std is not None and found.samples is not None
-
-
-def common_states(
-    names: Sequence[str], assessed: Sequence[Assessment], ds: TrajectoryDataset
-) -> tuple[tuple[str, ...], Floats]:
-    """The states that all members forecast, and their range over all episodes.
+def states_of(
+    assessed: Sequence[Assessment], ds: TrajectoryDataset
+) -> tuple[tuple[str, ...], Floats, Ints]:
+    """The states that all members forecast, their range over all episodes, and those logged.
 
     Raises
     ------
@@ -233,13 +154,25 @@ def common_states(
         If members forecast different ones.
     """
     first = assessed[0]
-    for name, other in zip(names, assessed):
+    for other in assessed:
         if other.state_names != first.state_names:
             raise ValueError(
-                f"members forecast different states: {names[0]!r} {', '.join(first.state_names)}; "
-                f"{name!r} {', '.join(other.state_names)}. Let all of them forecast the same ones."
+                f"members forecast different states: {first.name!r} "
+                f"{', '.join(first.state_names)}; {other.name!r} {', '.join(other.state_names)}. "
+                "Let all of them forecast the same ones."
             )
     found = first.state_range.copy()
     columns, _, logged = shared_states(first.state_names, ds)
     found[:, columns] = logged.min(axis=0), logged.max(axis=0)
-    return first.state_names, found
+    return first.state_names, found, columns
+
+
+def errors_in_ranges(
+    assessed: Sequence[Assessment], ds: TrajectoryDataset
+) -> tuple[Floats, Floats]:
+    """Residuals (M, n, H, k) in training ranges, and their mean squares over states (M, n, H)."""
+    _, state_range, columns = states_of(assessed, ds)
+    low, high = state_range[:, columns]
+    scaled = np.stack([a.residuals for a in assessed]) / np.where(high > low, high - low, 1.0)
+    with np.errstate(over="ignore"):
+        return scaled, (scaled**2).mean(axis=3)

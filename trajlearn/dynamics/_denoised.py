@@ -27,6 +27,7 @@ from trajlearn.dynamics._rolling import RollingEstimator
 from trajlearn.dynamics._rollout import Limits
 from trajlearn.dynamics._start_filter import filtered_starts
 from trajlearn.dynamics.baselines import CurveForecaster
+from trajlearn.exceptions import MissingFieldError
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 from trajlearn.trajectories import TrajectoryDataset, TransitionRelabeler, as_dataset
 from trajlearn.trajectories._columns import Columns
@@ -161,7 +162,9 @@ class DenoisedEstimator(RollingEstimator):
         # the states of a forecast are those that are measured
         self.state_range_, self.state_names_ = self.state_range_[:, :m], self.state_names_[:m]
         change = np.ptp(self.state_range_, axis=0) ** 2
-        self.noisy_ = bool((noise.measurement > _NOISE_FREE**2 * change).any())
+        least = _NOISE_FREE**2 * change
+        # a state that never changes has no range to tell noise by
+        self.noisy_ = bool(((noise.measurement > least) & (least > 0)).any())
         self.measurement_noise_ = np.sqrt(noise.measurement)
         self.process_noise_ = np.sqrt(noise.process)
 
@@ -215,7 +218,8 @@ class DenoisedEstimator(RollingEstimator):
         -------
         TrajectoryDataset
             The measured states are its `observed`, and it is marked as made in `hindsight`.
-            Episodes as they are if `fit` found no noise, or if they are marked already.
+            Episodes as they are if `fit` found no noise, or if they are marked already (and are
+            not positions whose velocities are asked for).
 
         Raises
         ------
@@ -224,12 +228,16 @@ class DenoisedEstimator(RollingEstimator):
         """
         check_is_fitted(self, "estimator_")
         ds, noise = as_dataset(X), getattr(self, "noise_", None)
-        if noise is None or ds.hindsight:
+        if noise is None:
+            return ds
+        # smoothed positions are without velocities still
+        complete = not self._is_latent() or ds.states.shape[1] == len(noise.process)
+        if ds.hindsight and complete:
             return ds
         ds = self._checked(ds)
         self._check_time_step(ds)
         m = ds.states.shape[1]
-        if self.latent_velocities:
+        if self._is_latent():
             return self._smoothed(with_velocities(ds), m, noise)
         if self.baseline_ is None:
             return self._smoothed(ds, m, noise)
@@ -244,7 +252,7 @@ class DenoisedEstimator(RollingEstimator):
 
     def _forecast_states(self, query: Query, request: Request) -> Prediction:
         prediction = super()._forecast_states(self._filtered(query), request)
-        if not self.latent_velocities:
+        if not self._is_latent():
             return prediction
         m = query.ds.states.shape[1]
         prediction.mean = prediction.mean[..., :m].copy()
@@ -256,17 +264,15 @@ class DenoisedEstimator(RollingEstimator):
 
     def _limits(self) -> Limits:
         limits = super()._limits()
-        if not self.latent_velocities:
+        if not self._is_latent():
             return limits
         width = np.ptp(self.rolled_range_, axis=0)
         return replace(limits, reach=DIVERGENCE_RANGES * np.where(width > 0, width, 1.0))
 
-    def _unseen_by(self, source: str) -> Floats | None:
-        std = super()._unseen_by(source)
-        if std is None or not self.latent_velocities:
-            return std
-        # a controller that measures positions has its velocities from somewhere
-        return np.concatenate([std, np.zeros_like(std)])
+    def _is_latent(self) -> bool:
+        """Whether the fitted step has velocities that episodes have not."""
+        noise = getattr(self, "noise_", None)
+        return noise is not None and len(noise.process) > len(noise.measurement)
 
     def _filtered(self, query: Query) -> Query:
         """The query with filtered starts, if there is noise."""
@@ -274,13 +280,25 @@ class DenoisedEstimator(RollingEstimator):
         if noise is None:
             return query
         self._check_time_step(query.ds)
+        if "action" in self.layout_ and query.start.any():
+            self._check_past_actions(query.ds)
+        ds = with_velocities(query.ds) if self._is_latent() else query.ds
+        query = replace(query, ds=ds)
         mean, covariance = filtered_starts(self, query, noise)
-        ds = with_velocities(query.ds) if self.latent_velocities else query.ds
         states = ds.states.copy()
         states[query.rows] = mean
         columns = Columns(**(vars(ds._columns) | {"states": states}))
         ds = TrajectoryDataset._of(columns.freeze(), ds._names)
         return replace(query, ds=ds, start_root=root_of(covariance))
+
+    def _check_past_actions(self, ds: TrajectoryDataset) -> None:
+        if ds.actions is None:
+            raise MissingFieldError(
+                f"{self._asked()} estimates the state at the start from the measurements and the "
+                "actions before it, but the episodes have no actions. Give them, or forecast from "
+                "the first state."
+            )
+        self._check_action_width(ds)
 
     def _moments(self, *, means_only: bool = False) -> Moments:
         moments = super()._moments(means_only=means_only)

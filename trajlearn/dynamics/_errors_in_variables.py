@@ -55,6 +55,9 @@ _STRETCH, _MARGIN = 512, 64
 _CELLS = 2**15
 # Stretches that the likelihood is summed over, and states in each.
 _FEW, _SHORT = 32, 200
+# Residuals of less than this, in the variance of the state, are round-off (a state that never
+# changes has none): the smoother divides by them.
+_SURELY_NONE = 1e-12
 # How much wider than all states a state is that nothing is known of: variance.
 _VAGUE = 1e4
 # Solutions about the last one that smoothing takes at most.
@@ -154,6 +157,9 @@ class Smoother:
             found[pieces.rows[pieces.kept]] = posterior.mean[pieces.kept]
             of = np.searchsorted(self.ds.offsets, pieces.rows[0, pieces.first])
             covariance[of] = posterior.covariance[0, pieces.first]
+        # what never changes has no noise, and a learner would blow up what round-off adds
+        still = np.ptp(self.model.rolled_range_, axis=0) == 0
+        found[:, still] = states[:, still]
         return found, covariance
 
     def smoothed(self, states: Floats, noise: NoiseModel) -> Floats:
@@ -223,7 +229,9 @@ def first_noise(
     m = smoother.n_measured
     after, slopes = smoother.step(states)
     shown = residual_noise(states[smoother.ends] - after, slopes, smoother.episode)
-    unit = shown.residual / 2
+    variance = states.var(axis=0)
+    least = _SURELY_NONE * np.where(variance > 0, variance, 1.0)
+    unit = np.maximum(shown.residual / 2, least)
     if measurement is None:
         if not shown.found.any():
             return None, shown.residual
@@ -231,7 +239,7 @@ def first_noise(
     else:
         # a guess of what is not measured has smoothed the rest
         unit[:m] = np.maximum(unit[:m], measurement)
-    spread = _VAGUE * np.maximum(states.var(axis=0), shown.residual)
+    spread = _VAGUE * np.maximum(np.maximum(variance, shown.residual), least)
     anywhere = states.mean(axis=0)
     noise = NoiseModel(
         measurement=np.maximum(measurement, least_variance(unit)[:m]),

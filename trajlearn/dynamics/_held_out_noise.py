@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trajlearn.dynamics._assessment import Assessment
 from trajlearn.dynamics._calibration import Residuals
+from trajlearn.dynamics._entrant import Assessment
 from trajlearn.dynamics._horizon_losses import kernel_of, knots_of
 from trajlearn.dynamics._residual_paths import ResidualPaths, residual_paths
 

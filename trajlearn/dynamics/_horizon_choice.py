@@ -30,17 +30,6 @@ class Choice:
     weights: Floats
 
 
-def best_overall(losses: HorizonLosses) -> int:
-    """The member of least mean loss over all steps; among equals the first."""
-    means = losses.means
-    # who does not forecast as many episodes at some step loses to all who do
-    lacking = ~np.isfinite(means)
-    total = (np.where(lacking, 0.0, means) * losses.width).sum(axis=1)
-    steps_lacking = (lacking * losses.width).sum(axis=1)
-    order = np.lexsort((total, steps_lacking))
-    return int(order[0])
-
-
 def pick(losses: HorizonLosses, margin: float) -> Choice:
     """The member that is best overall; where another one is surely better, that one.
 
@@ -50,7 +39,7 @@ def pick(losses: HorizonLosses, margin: float) -> Choice:
     margin : float
         Standard errors, paired by episode, by which it has to be better.
     """
-    best = best_overall(losses)
+    best = losses.ranking()[0]
     means = losses.means
     rival = means.argmin(axis=0)
     gain, error = losses.gain(rival, np.full_like(rival, best))

@@ -55,11 +55,26 @@ class HorizonLosses:
     typical: Floats
 
     @property
+    def averages(self) -> Floats:
+        """Mean over the episodes that a member forecasts to a horizon (M, K); NaN of none."""
+        known = ~np.isnan(self.values)
+        total, count = np.where(known, self.values, 0.0).sum(axis=1), known.sum(axis=1)
+        return np.divide(total, count, out=np.full(total.shape, np.nan), where=count > 0)
+
+    @property
     def means(self) -> Floats:
         """Mean over episodes (M, K); inf where a member is not eligible."""
-        known = ~np.isnan(self.values)
-        total = np.where(known, self.values, 0.0).sum(axis=1)
-        return np.where(self.eligible, total / np.maximum(known.sum(axis=1), 1), np.inf)
+        return np.where(self.eligible, self.averages, np.inf)
+
+    def ranking(self, knots: slice = slice(None)) -> list[int]:
+        """Members by their mean loss over a block of horizons, the best first.
+
+        Who does not forecast as many episodes at some step as others do is behind all who do.
+        """
+        width = self.width[knots]
+        lacking = (~self.eligible[:, knots] * width).sum(axis=1)
+        reached = np.nan_to_num(self.averages[:, knots])
+        return [int(i) for i in np.lexsort(((reached * width).sum(axis=1), lacking))]
 
     def gain(self, one: Ints, other: Ints) -> tuple[Floats, Floats]:
         """How much less a member loses than another, paired by episode, and how surely.

@@ -36,7 +36,23 @@ def guessed_velocities(ds: TrajectoryDataset) -> tuple[list[TrajectoryDataset], 
     list of TrajectoryDataset
     variance : ndarray of shape (m,)
         Of the measurement noise.
+
+    Raises
+    ------
+    ValueError
+        If velocities are among the states already, or no episode has three states.
     """
+    logged = [name for name in ds.state_names if f"d_{name}" in ds.state_names]
+    if logged:
+        raise ValueError(
+            f"latent_velocities=True takes positions, but the states have d_{logged[0]} beside "
+            f"{logged[0]}: select the positions (ds.select_states), or leave it out."
+        )
+    if ds.lengths.max() < 2:
+        raise ValueError(
+            "latent_velocities=True needs episodes of two steps or more: a single difference of "
+            "positions does not tell motion from noise."
+        )
     smoother = KalmanSmoother()
     with warnings.catch_warnings():
         # what follows is a better model of the motion

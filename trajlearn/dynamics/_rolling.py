@@ -121,6 +121,11 @@ class RollingEstimator(DynamicsEstimator):
     ) -> None:
         rows, targets = self.relabeler_.fit_resample(ds)
         self.layout_ = self.relabeler_.layout_
+        if "past_actions" in self.layout_ and "action" not in self.layout_:
+            raise ValueError(
+                f'inputs={self.relabeler_.inputs!r}: "past_actions" are known in a roll-out only '
+                'where "action" is an input, too. Add it, or leave them out.'
+            )
         blind = "action" in self.layout_ and "references" not in self.layout_
         if self.baseline_ is not None and blind:
             raise ValueError(

@@ -114,7 +114,8 @@ def _sees(evidence: Evidence, i: int) -> str:
 def _ratio(evidence: Evidence, one: int, other: int) -> float:
     """Error of a member in units of another's."""
     n_steps = evidence.errors.shape[2]
-    errors = [max(evidence.error(i, 1, n_steps), 1e-300) for i in (one, other)]
+    pair = (one, other), (other, one)
+    errors = [max(evidence.error(i, 1, n_steps, beside), 1e-300) for i, beside in pair]
     return errors[0] / errors[1]
 
 

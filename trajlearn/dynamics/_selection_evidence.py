@@ -54,8 +54,9 @@ class ReportsSelection:
             is greater: below 1 the two are as good as equal. Negative: the second is better
             there, but not surely enough to be preferred to the member that is best overall.
 
-            By member: ``steps`` that it wins, its ``error``, ``loss`` and ``n_diverged`` over all
-            steps, ``fit_seconds`` (all fits), ``predict_seconds`` (all held-out episodes) and the
+            By member: ``steps`` that it wins, ``n_episodes`` that it was judged by (fewer if it
+            left the race), its ``error``, ``loss`` and ``n_diverged`` over all steps of these,
+            ``fit_seconds`` (all its fits), ``predict_seconds`` (all these episodes) and the
             ``measurement_noise`` that it found, in percent of the training range.
         """
         if by not in ("horizon", "member"):

@@ -52,10 +52,15 @@ class Evidence:
         ends = np.append(begins[1:], len(winner))
         return [(int(winner[a]), int(a) + 1, int(b)) for a, b in zip(begins, ends)]
 
-    def error(self, member: int, first: int, last: int) -> float:
-        """Median over episodes of the squared error, averaged over the steps from 1."""
+    def error(self, member: int, first: int, last: int, beside: int | None = None) -> float:
+        """Median over episodes of the squared error, averaged over the steps from 1.
+
+        Beside another member, only what that one was judged by as well counts.
+        """
         some = self.errors[member, :, first - 1 : last]
         known = ~np.isnan(some)
+        if beside is not None:
+            known &= ~np.isnan(self.errors[beside, :, first - 1 : last])
         reached = known.any(axis=1)
         if not reached.any():
             return np.nan
@@ -69,9 +74,7 @@ class Evidence:
 
     def ranking(self, first: int, last: int) -> list[int]:
         """Members by their mean loss over a block of steps, the best first."""
-        at = self.knots(first, last)
-        loss = self.losses.means[:, at] @ self.losses.width[at]
-        return [int(i) for i in np.argsort(loss, kind="stable")]
+        return self.losses.ranking(self.knots(first, last))
 
 
 def errors_by_horizon(evidence: Evidence) -> "pd.DataFrame":
@@ -85,7 +88,7 @@ def errors_by_horizon(evidence: Evidence) -> "pd.DataFrame":
     some = np.where(absent.all(axis=1, keepdims=True), 0.0, evidence.errors)
     losses = [
         np.interp(np.log(np.arange(1, n_steps + 1)), np.log(evidence.losses.knots), loss)
-        for loss in evidence.losses.means
+        for loss in evidence.losses.averages
     ]
     columns = {
         "median": np.nanmedian(some, axis=1),
@@ -117,8 +120,9 @@ def by_horizon(evidence: Evidence) -> "pd.DataFrame":
             second = others[0]
             gain, unsure = evidence.losses.over(evidence.knots(first, last), winner, second)
             missed = evidence.error(second, first, last)
+            beside = evidence.error(winner, first, last, second)
             row["second"] = evidence.names[second]
-            row["ratio"] = missed / error if error else np.nan
+            row["ratio"] = missed / beside if beside else np.nan
             sure = np.inf if gain > 0 else -np.inf if gain < 0 else 0.0
             row["standard_errors"] = gain / unsure if unsure else sure
         rows.append(row)
@@ -133,7 +137,10 @@ def by_member(evidence: Evidence) -> "pd.DataFrame":
     winner = evidence.weights.argmax(axis=1)
     low, high = evidence.state_range
     width = np.where(high > low, high - low, 1.0)
-    loss = evidence.losses.means @ evidence.losses.width / n_steps
+    averages = evidence.losses.averages
+    steps = evidence.losses.width * ~np.isnan(averages)
+    loss = (np.nan_to_num(averages) * steps).sum(axis=1) / steps.sum(axis=1)
+    judged = (~np.isnan(evidence.errors).all(axis=2)).sum(axis=1)
     rows = []
     for i in evidence.ranking(1, n_steps):
         name, noise = evidence.names[i], measurement_noise(evidence.models[i])
@@ -141,6 +148,7 @@ def by_member(evidence: Evidence) -> "pd.DataFrame":
             {
                 "member": name,
                 "steps": int((winner == i).sum()),
+                "n_episodes": int(judged[i]),
                 "error": evidence.error(i, 1, n_steps),
                 "loss": loss[i],
                 "n_diverged": int(np.isinf(evidence.errors[i]).any(axis=1).sum()),

@@ -28,7 +28,7 @@ def filtered_starts(model: Any, query: Query, noise: NoiseModel) -> tuple[Floats
     model : RollingEstimator
         Fitted.
     query : Query
-        Its states are those measured.
+        Its states are those of the step, of which those measured are read.
     noise : NoiseModel
 
     Returns
@@ -41,7 +41,7 @@ def filtered_starts(model: Any, query: Query, noise: NoiseModel) -> tuple[Floats
     begin = ds.offsets[:-1]
     first = np.ones(n, dtype=bool)
     mean, covariance, surprise = _updated(*noise.start(first), ds.states[begin], noise)
-    first = surprise < chi2.ppf(1 - _ELSEWHERE, ds.states.shape[1])
+    first = surprise < chi2.ppf(1 - _ELSEWHERE, len(noise.measurement))
     if not first.all():
         mean, covariance, _ = _updated(*noise.start(first), ds.states[begin], noise)
     process = np.diag(noise.process)

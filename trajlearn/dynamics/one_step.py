@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import Interval, StrOptions
 from trajlearn.dynamics._denoised import DenoisedEstimator
@@ -83,7 +84,8 @@ class OneStepRegressor(DenoisedEstimator):
         themselves, or the measurements that are logged. With "measurements" the policy, given or
         cloned, acts in a roll-out on predicted states with noise of `measurement_noise_`, for
         which `denoise` is needed. The mean of a forecast is then that of `n_particles`
-        roll-outs, always the same ones. Not with "moment" and "unscented".
+        roll-outs, always the same ones. Not with "moment" and "unscented", and not with
+        `latent_velocities`: no log tells which velocities a controller acted on.
     rollout_actions : {"auto", "logged", "policy"}, default="auto"
         "auto": the policy if there is one, else the logged actions.
     clip_states : float or None, default=None
@@ -279,21 +281,32 @@ class OneStepRegressor(DenoisedEstimator):
                 f"loss_horizon={self.loss_horizon} needs episodes: rows do not say which follow "
                 "others. Fit on episodes, or leave loss_horizon=1."
             )
+        self._check_sight()
         super()._fit_door_of_rows(X, y, sample_weight, groups)
 
     def _fit_episodes(
         self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
     ) -> None:
-        if self.policy_sees == "measurements" and self.denoise is None:
-            raise ValueError(
-                'policy_sees="measurements" needs to know how noisy they are: set denoise="em", or '
-                'leave policy_sees="states".'
-            )
+        self._check_sight()
         if self.loss_horizon > 1:
             check_unrollable(self)
         super()._fit_episodes(ds, weight, groups)
         if self.loss_horizon > 1:
             train_on_rollouts(self, self.smooth(ds), weight, self._rng)
+
+    def _check_sight(self) -> None:
+        if self.policy_sees == "states":
+            return
+        if self.latent_velocities:
+            raise ValueError(
+                'policy_sees="measurements" does not go with latent_velocities=True: the log does '
+                "not tell which velocities the controller acted on. Leave one of the two out."
+            )
+        if self.denoise is None:
+            raise ValueError(
+                'policy_sees="measurements" needs to know how noisy they are: set denoise="em", or '
+                'leave policy_sees="states".'
+            )
 
     def _fit_policy(
         self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
@@ -380,7 +393,12 @@ class OneStepRegressor(DenoisedEstimator):
         return Prediction(rolled.mean, std, rolled.samples)
 
     def _unseen_by(self, source: str) -> Floats | None:
-        if source != "policy" or self.policy_sees == "states" or not self.measurement_noise_.any():
+        if source != "policy" or self.policy_sees == "states":
+            return None
+        # fit has checked it, but it may have been set since
+        self._check_sight()
+        check_is_fitted(self, "measurement_noise_")
+        if not self.measurement_noise_.any():
             return None
         if self.propagation in BY_GAUSSIANS:
             raise ValueError(

@@ -13,7 +13,13 @@ from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import Interval, StrOptions, fit_context
-from trajlearn.dynamics._assessment import assess_all, common_states, held_out_folds, units_of
+from trajlearn.dynamics._assessment import (
+    assess_all,
+    errors_in_ranges,
+    held_out_folds,
+    states_of,
+    units_of,
+)
 from trajlearn.dynamics._conformal import steps_of
 from trajlearn.dynamics._default_members import default_members
 from trajlearn.dynamics._episode_arguments import in_groups
@@ -25,7 +31,6 @@ from trajlearn.dynamics._meta import MetaForecaster
 from trajlearn.dynamics._mixed_forecast import Part, cut_after, mixed, shortened
 from trajlearn.dynamics._named_members import NamedMembers, checked_members, with_policy
 from trajlearn.dynamics._selection_evidence import ReportsSelection
-from trajlearn.dynamics._shared_states import shared_states
 from trajlearn.dynamics.distilled import DistilledForecaster
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.exceptions import DivergenceWarning
@@ -92,19 +97,27 @@ class HorizonSelector(ReportsSelection, NamedMembers, MetaForecaster):
         weights that fall from the middle on. 0 takes each step by itself.
     n_blended : int, default=5
         Members that "blend" combines.
+    race : bool, default=True
+        A member leaves after the first or the second fold if it is behind another one: its loss
+        over all horizons is greater by more than two standard errors, and at no horizon is it
+        likely to be more than slightly better. It costs a part of a full fit then. Five episodes
+        (groups) have to be held out first; "blend" keeps the `n_blended` best. False judges all
+        members by all folds: that takes two to three times as long where networks are behind.
     error_score : float, default=-1e12
         Score of a diverged episode.
     random_state : int, RandomState or None, default=None
     n_jobs : int or None, default=None
         Members fitted at once, as in joblib.
     verbose : int, default=0
-        1 shows a progress bar, 2 also those of members.
+        1 shows a progress bar of all fits, with the members and folds that are at it; 2 also those
+        of members.
 
     Attributes
     ----------
     names_ : tuple of str
     estimators_ : list of estimator
-        Members, fitted on all episodes.
+        Members, fitted on all episodes. One that left the race was fitted on the training
+        episodes of the first fold only (one that smooths episodes, on all), and is never chosen.
     best_ : str
         The member of least loss over all horizons.
     weights_ : ndarray of shape (H, M)
@@ -112,10 +125,12 @@ class HorizonSelector(ReportsSelection, NamedMembers, MetaForecaster):
     choice_ : ndarray of shape (H,)
         Name of the member of greatest weight at each step.
     cv_errors_ : DataFrame
-        One row a member and horizon: ``member``, ``horizon``, ``n_episodes``, ``n_diverged``, the
-        ``median`` and ``mean`` squared error in training ranges, and the ``loss``.
+        One row a member and horizon: ``member``, ``horizon``, ``n_episodes`` that the member was
+        judged by (fewer if it left the race), ``n_diverged`` of these, the ``median`` and ``mean``
+        of their squared errors in training ranges, and the ``loss``.
     fit_seconds_, predict_seconds_ : dict from name to float
-        Of all fits of a member, and of one forecast of all episodes.
+        Of all fits of a member (a policy that several of them share counts for each), and of one
+        forecast of all episodes it was judged by.
     state_range_ : ndarray of shape (2, d_s)
     state_names_ : tuple of str
     dt_ : float
@@ -174,6 +189,7 @@ class HorizonSelector(ReportsSelection, NamedMembers, MetaForecaster):
         "margin": [Interval(Real, 0, None, closed="left")],
         "bandwidth": [Interval(Real, 0, None, closed="left")],
         "n_blended": [Interval(Integral, 1, 10, closed="both")],
+        "race": ["boolean"],
         "error_score": [Interval(Real, None, 0, closed="both")],
         "random_state": ["random_state"],
         "n_jobs": [Integral, None],
@@ -190,6 +206,7 @@ class HorizonSelector(ReportsSelection, NamedMembers, MetaForecaster):
         margin: float = 1.0,
         bandwidth: float = 0.3,
         n_blended: int = 5,
+        race: bool = True,
         error_score: float = -1e12,
         random_state: Any = None,
         n_jobs: int | None = None,
@@ -202,6 +219,7 @@ class HorizonSelector(ReportsSelection, NamedMembers, MetaForecaster):
         self.margin = margin
         self.bandwidth = bandwidth
         self.n_blended = n_blended
+        self.race = race
         self.error_score = error_score
         self.random_state = random_state
         self.n_jobs = n_jobs
@@ -241,21 +259,20 @@ class HorizonSelector(ReportsSelection, NamedMembers, MetaForecaster):
         seed = check_random_state(self.random_state).randint(2**31, size=4)
         splitting, fitting = np.random.default_rng(seed).spawn(2)
         members = self._members(ds)
+        folds = held_out_folds(ds, self.cv, splitting)
         assessed = assess_all(
             members,
             ds,
-            held_out_folds(ds, self.cv, splitting),
+            folds,
             fitting,
+            bandwidth=self.bandwidth,
+            n_kept=(1 if self.rule == "pick" else self.n_blended) if self.race else None,
             n_jobs=self.n_jobs,
             verbose=self.verbose,
         )
         names = tuple(name for name, _ in members)
-        self.state_names_, self.state_range_ = common_states(names, assessed, ds)
-        columns, _, _ = shared_states(self.state_names_, ds)
-        low, high = self.state_range_[:, columns]
-        scaled = np.stack([a.residuals for a in assessed]) / np.where(high > low, high - low, 1.0)
-        with np.errstate(over="ignore"):
-            self._errors = (scaled**2).mean(axis=3)
+        self.state_names_, self.state_range_, columns = states_of(assessed, ds)
+        scaled, self._errors = errors_in_ranges(assessed, ds)
         self._units = units_of(ds)
         losses = self._losses()
         self.names_, self.estimators_ = names, [a.model for a in assessed]

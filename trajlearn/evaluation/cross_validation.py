@@ -1,24 +1,21 @@
 """Cross-validation over episodes and horizons."""
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Sequence
 from numbers import Integral
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import ArrayLike, NDArray
 from sklearn.base import clone
 from sklearn.model_selection import GroupKFold, check_cv
-from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from trajlearn.dynamics import Forecast
 from trajlearn.evaluation._horizons import errors_at, predicted_states, whole_steps
 from trajlearn.evaluation._matching import episode_of
 from trajlearn.evaluation.errors import summarise
-from trajlearn.regressors._threads import threads_for
+from trajlearn.regressors._threads import by_workers
 from trajlearn.trajectories import TrajectoryDataset, as_dataset
 
 if TYPE_CHECKING:
@@ -256,22 +253,6 @@ def _map_folds(
     *args: Any,
 ) -> list[Any]:
     """``work(clone, ds, fold, *args)`` of each fold, in order."""
-    parallel = effective_n_jobs(n_jobs) > 1
-    # here for workers that are threads, in `_run` for those that are processes
-    with _one_thread() if parallel else nullcontext():
-        results: Iterator[Any] = Parallel(n_jobs=n_jobs, return_as="generator")(
-            delayed(_run)(parallel, work, clone(estimator), ds, fold, *args) for fold in folds
-        )
-        return list(tqdm(results, total=len(folds), desc="folds", disable=not verbose))
-
-
-def _run(parallel: bool, work: Callable[..., Any], *args: Any) -> Any:
-    with _one_thread() if parallel else nullcontext():
-        return work(*args)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Workers with several threads each would wait for one another."""
-    with threadpool_limits(limits=1), threads_for(0):
-        yield
+    jobs = [(clone(estimator), ds, fold, *args) for fold in folds]
+    results = by_workers(work, jobs, n_jobs)
+    return list(tqdm(results, total=len(folds), desc="folds", disable=not verbose))

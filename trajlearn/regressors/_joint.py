@@ -45,13 +45,18 @@ def can_join(learners: Sequence[Any]) -> bool:
 
 
 def fit_jointly(
-    learners: Sequence[MLPEnsembleRegressor], jobs: Sequence[Job], *, verbose: int = 0
+    learners: Sequence[MLPEnsembleRegressor],
+    jobs: Sequence[Job],
+    *,
+    least_steps: int = 0,
+    verbose: int = 0,
 ) -> None:
     """Fit learners together.
 
-    All take as many steps as the one that would take the most alone; otherwise each gets what it
-    would alone, up to rounding (one learner by itself: the same bits). Jobs whose batches have
-    different sizes (fewer rows than `batch_size`) are trained apart.
+    All take as many steps as the one that would take the most alone, and no fewer than
+    `least_steps`; otherwise each gets what it would alone, up to rounding (one learner by itself:
+    the same bits). Jobs whose batches have different sizes (fewer rows than `batch_size`) are
+    trained apart.
 
     Parameters
     ----------
@@ -59,6 +64,7 @@ def fit_jointly(
         `can_join` must hold.
     jobs : sequence of callable
         One a learner, such as ``lambda learner: learner._on_rows(X, y, None, None)``.
+    least_steps : int, default=0
     verbose : int, default=0
     """
     trainings = [job(learner) for learner, job in zip(learners, jobs)]
@@ -69,7 +75,7 @@ def fit_jointly(
     ]
     parts.sort(key=lambda part: part.shape)  # stable
     for _, group in groupby(parts, key=lambda part: part.shape):
-        _fit_group(list(group), verbose)
+        _fit_group(list(group), least_steps, verbose)
 
 
 class _Part:
@@ -86,10 +92,10 @@ class _Part:
         self.shape = (*first[0].shape[1:], first[1].shape[2])
 
 
-def _fit_group(parts: list[_Part], verbose: int) -> None:
+def _fit_group(parts: list[_Part], least_steps: int, verbose: int) -> None:
     learner = parts[0].learner
     settings = Settings(
-        max(part.training.n_steps for part in parts),
+        max(least_steps, *(part.training.n_steps for part in parts)),
         learner.learning_rate,
         learner.schedule,
         verbose=bool(verbose),
