@@ -7,17 +7,20 @@ import joblib
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import BaseEstimator
-from sklearn.frozen import FrozenEstimator
 from sklearn.model_selection import GroupKFold
 
 from benchmarks.paper._rollouts import expected_warnings
 from benchmarks.regimes._episodes import Episodes, episodes
 from benchmarks.regimes._regimes import REGIMES, Regime
 from benchmarks.regimes._scores import scores
-from trajlearn import Forecast, OneStepRegressor, TrajectoryDataset
-from trajlearn.dynamics._default_members import default_members
+from trajlearn import (
+    Forecast,
+    HorizonSelector,
+    OneStepRegressor,
+    TrajectoryDataset,
+    default_members,
+)
 from trajlearn.dynamics._joint_folds import fit_folds
-from trajlearn.dynamics.selector import HorizonSelector
 from trajlearn.regressors import polynomial
 from trajlearn.regressors.control_law import ControlLawRegressor
 
@@ -29,8 +32,6 @@ N_FOLDS = 4
 #: Gradient steps of a network in quick mode, and its members.
 QUICK_STEPS = 400
 QUICK = ("poly1", "poly3", "poly1_em", "poly3_em", "network", "C", "T")
-# past states that a model of positions sees
-_WINDOW = 5
 
 
 def members_of(regime: Regime, ds: TrajectoryDataset, policy: Any, mode: str) -> Members:
@@ -41,19 +42,16 @@ def members_of(regime: Regime, ds: TrajectoryDataset, policy: Any, mode: str) ->
     """
     if "unknown" in regime.policies:
         policy = "clone"
-    members = default_members(ds, policy=policy)
-    if regime.states:
-        members += [
-            (f"{name}_window", _one_step(learner, policy, history=_WINDOW))
-            for name, learner in (("poly1", polynomial(degree=1)), ("network", None))
-        ]
-        members += [
-            (f"poly{k}_latent", _one_step(polynomial(degree=k), policy, latent_velocities=True))
-            for k in (1, 3)
-        ]
+    members = default_members(ds, policy=policy, partial=bool(regime.states))
     if regime.acts_on_noise:
-        sees = {"denoise": "em", "policy_sees": "measurements"}
-        members.append(("poly1_em_sees", _one_step(polynomial(degree=1), policy, **sees)))
+        sees = OneStepRegressor(
+            polynomial(degree=1),
+            policy=policy,
+            clip_states=1.2,
+            denoise="em",
+            policy_sees="measurements",
+        )
+        members.append(("poly1_em_sees", sees))
     laws = Laws()
     for _, model in members:
         if getattr(model, "policy", None) == "clone":
@@ -64,10 +62,6 @@ def members_of(regime: Regime, ds: TrajectoryDataset, policy: Any, mode: str) ->
             if name in ("network", "C", "T"):
                 model.set_params(estimator__max_steps=QUICK_STEPS)
     return members
-
-
-def _one_step(learner: Any, policy: Any, **settings: Any) -> OneStepRegressor:
-    return OneStepRegressor(learner, policy=policy, clip_states=1.2, **settings)
 
 
 class Laws(dict[str, ControlLawRegressor]):
@@ -100,7 +94,8 @@ class OnceFitted(ControlLawRegressor):
 class HeldOut(BaseEstimator):
     """A fitted member that answers for held-out episodes by the model that has not seen them.
 
-    It lets a selector judge members that were fitted before, under one policy and another.
+    It lets a selector judge members that were fitted before, under one policy and another; it is
+    its own clone, and takes no time to fit.
 
     Parameters
     ----------
@@ -121,6 +116,9 @@ class HeldOut(BaseEstimator):
 
     def fit(self, X: Any, y: None = None) -> "HeldOut":
         """Do nothing: it is fitted."""
+        return self
+
+    def __sklearn_clone__(self) -> "HeldOut":
         return self
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -196,8 +194,8 @@ def judged(
     for name, member in members.items():
         found["models"][name] = _scores(member, data)
     for rule in RULES:
-        frozen = [(name, FrozenEstimator(member)) for name, member in members.items()]
-        selector = HorizonSelector(frozen, cv=folds, rule=rule, random_state=0).fit(data.train)
+        selector = HorizonSelector(list(members.items()), cv=folds, rule=rule, random_state=0)
+        selector.fit(data.train)
         found["models"][rule] = _scores(selector, data)
         if rule == "pick":
             found |= {"best": selector.best_, "choice": _stretches(selector.choice_)}

@@ -24,6 +24,7 @@ COLUMNS = {
     "poly1_em": "polynomial 1",
     "poly3_em": "polynomial 3",
     "network_em": "network",
+    "poly1_latent": "latent velocities",
     "poly1_window": "5 past states",
     "poly1_em_sees": "noisy policy",
     "C": "closed loop C",
@@ -34,7 +35,7 @@ COLUMNS = {
     "GP": "GP",
     "pick": "selector",
 }
-_GROUPS = {"one-step": 3, "denoised": 3, "polynomial 1": 2, "with θ": 2, "peers": 4, "": 1}
+_GROUPS = {"one-step": 3, "denoised": 3, "polynomial 1": 3, "with θ": 2, "peers": 4, "": 1}
 #: Short names of models in cells.
 _SHORT = {
     "poly1": "P1",
@@ -45,8 +46,9 @@ _SHORT = {
     "poly2_em": "P2, den.",
     "poly3_em": "P3, den.",
     "network_em": "net, den.",
+    "poly1_latent": "P1, latent",
+    "poly2_latent": "P2, latent",
     "poly1_window": "P1, 5 states",
-    "network_window": "net, 5 states",
     "poly1_em_sees": "P1, den., sees",
 }
 # ratios from which a cell is as dark as it gets

@@ -63,6 +63,7 @@ _CARTPOLE = (
     Regime("20 episodes, noise 3 %", n_train=20, noise=0.03),
     # without velocities the controller's law cannot be evaluated
     Regime("positions only", states=("x", "theta"), policies=("unknown",)),
+    Regime("positions, noise 1 %", noise=0.01, states=("x", "theta"), policies=("unknown",)),
     Regime("logged every 5", every=5),
     Regime("logged every 10", every=10),
     Regime("acts on noise 3 %", noise=0.03, acts_on_noise=True),

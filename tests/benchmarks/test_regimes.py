@@ -210,6 +210,13 @@ def test_a_known_policy_is_cloned_only_where_it_is_also_judged_unknown():
         assert members["poly1"].policy == members["poly1_em_sees"].policy == wanted
 
 
+def test_where_velocities_are_missing_members_make_up_for_them():
+    data = episodes(Regime("some", states=("x", "theta"), **SMALL), 3, "quick")
+    for regime, wanted in (("positions only", True), ("clean", False)):
+        members = dict(_members.members_of(REGIMES["cartpole", regime], data.train, None, "full"))
+        assert ("poly1_latent" in members) == ("poly1_window" in members) == wanted
+
+
 def test_five_episodes_are_left_out_one_by_one():
     assert len(folds_of(episodes(Regime("s", n_train=5, length=5), 3, "quick").train, 0)) == 5
     assert len(folds_of(episodes(Regime("s", n_train=9, length=5), 3, "quick").train, 0)) == 4

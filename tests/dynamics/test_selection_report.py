@@ -190,9 +190,10 @@ def test_wide_states_have_no_polynomials_of_high_degree():
 def test_members_for_partial_states_are_asked_for():
     ds = linear(12, shortest=20, longest=20)
     more = dict(default_members(ds, policy=gain_policy, partial=True)[8:-2])
-    assert list(more) == ["poly1_latent", "poly2_latent", "poly2_window"]
-    assert more["poly2_window"].history == 3
-    assert more["poly2_window"].policy is gain_policy
+    latent = ["poly1_latent", "poly2_latent", "poly3_latent"]
+    assert list(more) == [*latent, "poly1_window", "network_window"]
+    assert {more["poly1_window"].history, more["network_window"].history} == {5}
+    assert more["poly1_window"].policy is gain_policy
     assert more["poly1_latent"].latent_velocities
     # a policy of the logged states does not know estimated ones
     assert more["poly1_latent"].policy == "clone"

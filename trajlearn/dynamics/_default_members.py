@@ -17,6 +17,8 @@ __all__ = ["default_members"]
 _CLIP = 1.2
 # a polynomial has at most this many terms, and half as many as there are steps
 _MOST_TERMS = 1000
+# past states where one does not say all
+_WINDOW = 5
 
 
 def default_members(
@@ -37,10 +39,10 @@ def default_members(
     rollout_actions : {"auto", "logged", "policy"}, default="auto"
         "logged": one-step models replay the logged actions, and need no policy.
     partial : bool, default=False
-        Also one-step models for states of which a part is not logged: ``poly1_latent`` and
-        ``poly2_latent`` estimate velocities (equal steps only; they learn the policy themselves,
-        since one that was given does not know estimated states), ``poly2_window`` sees the last
-        three states.
+        Also one-step models for states of which a part is not logged: ``poly1_latent``,
+        ``poly2_latent`` and ``poly3_latent`` estimate velocities (equal steps only; they learn the
+        policy themselves, since one that was given does not know estimated states),
+        ``poly1_window`` and ``network_window`` see the last five states.
     lstm : bool, default=False
         Also a recurrent network, which takes longer than all others; it needs a policy that is
         known, or replays the logged actions.
@@ -94,19 +96,19 @@ def _for_partial_states(
     learners: list[tuple[str, Any]], settings: dict[str, Any], irregular: bool
 ) -> list[tuple[str, Any]]:
     """One-step models that estimate velocities, or see more than one state."""
-    polynomials = dict(learners[:-1])
     members = []
     if not irregular:
         own = settings | ({"policy": "clone"} if "policy" in settings else {})
         members = [
             (f"{name}_latent", OneStepRegressor(learner, latent_velocities=True, **own))
-            for name, learner in polynomials.items()
-            if name in ("poly1", "poly2")
+            for name, learner in learners[:-1]
         ]
-    if "poly2" in polynomials:
-        window = OneStepRegressor(polynomials["poly2"], history=3, **settings)
-        members.append(("poly2_window", window))
-    return members
+    # higher powers of so many inputs go anywhere in a roll-out
+    return members + [
+        (f"{name}_window", OneStepRegressor(learner, history=_WINDOW, **settings))
+        for name, learner in learners
+        if name in ("poly1", "network")
+    ]
 
 
 def _learners(ds: TrajectoryDataset, irregular: bool) -> list[tuple[str, Any]]:
