@@ -20,7 +20,7 @@ from trajlearn import (
     TrajectoryDataset,
     default_members,
 )
-from trajlearn.dynamics._joint_folds import fit_folds
+from trajlearn.dynamics._selection.joint_folds import fit_folds
 from trajlearn.regressors import polynomial
 from trajlearn.regressors.control_law import ControlLawRegressor
 

@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import norm
 
 from trajlearn import Forecast, TrajectoryDataset
-from trajlearn.dynamics._calibration import Residuals
-from trajlearn.dynamics._conformal import marginal_bands
+from trajlearn.dynamics._uncertainty.calibration import Residuals
+from trajlearn.dynamics._uncertainty.conformal import marginal_bands
 
 
 def make(lengths=(3, 2, 4), *, n_steps=None, diverged=(0, 0, 0), seed=0, samples=5, **changes):

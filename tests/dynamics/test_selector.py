@@ -36,7 +36,7 @@ EARLY, LATE = Off(0.0, 0.2), Off(0.2, 0.0)
 
 def selector(*members, **settings):
     names = [f"m{i}" for i in range(len(members))]
-    # all members are judged by all episodes; tests/dynamics/test_race.py is about the race
+    # all members are judged by all episodes; the race has tests of its own
     settings = {"random_state": 0, "race": False, **settings}
     return HorizonSelector(list(zip(names, members)), **settings)
 

@@ -1,7 +1,7 @@
 """Formulations of dynamics: relabel, scale, learn, forecast."""
 
-from trajlearn.dynamics._default_members import default_members
 from trajlearn.dynamics._differentiable import differentiable
+from trajlearn.dynamics._selection.default_members import default_members
 from trajlearn.dynamics.baselines import (
     CurveForecaster,
     HoldForecaster,

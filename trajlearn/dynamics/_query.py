@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trajlearn.dynamics._propagation_algebra import applied
+from trajlearn.dynamics.propagation._algebra import applied
 from trajlearn.exceptions import MixedSamplingError
 from trajlearn.trajectories import TrajectoryDataset
 from trajlearn.trajectories.times import episode_steps, time_grids

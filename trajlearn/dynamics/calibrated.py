@@ -12,18 +12,18 @@ from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import HasMethods, Interval, StrOptions, fit_context
-from trajlearn.dynamics._calibration import Residuals, crps_rescaling
-from trajlearn.dynamics._conformal import (
+from trajlearn.dynamics._episode_arguments import in_groups
+from trajlearn.dynamics._meta import ForecasterAround, forecaster_can
+from trajlearn.dynamics._shared_states import shared_states
+from trajlearn.dynamics._uncertainty.calibration import Residuals, crps_rescaling
+from trajlearn.dynamics._uncertainty.conformal import (
     ConformalBands,
     marginal_bands,
     simultaneous_bands,
     steps_of,
 )
-from trajlearn.dynamics._episode_arguments import in_groups
-from trajlearn.dynamics._held_out import fit_and_forecast, residuals_of
-from trajlearn.dynamics._meta import ForecasterAround, forecaster_can
-from trajlearn.dynamics._residual_paths import ResidualPaths, residual_paths
-from trajlearn.dynamics._shared_states import shared_states
+from trajlearn.dynamics._uncertainty.held_out import fit_and_forecast, residuals_of
+from trajlearn.dynamics._uncertainty.residual_paths import ResidualPaths, residual_paths
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.dynamics.trajectory import TrajectoryRegressor
 from trajlearn.exceptions import CalibrationWarning, HorizonWarning
@@ -117,7 +117,7 @@ class CalibratedForecaster(ForecasterAround):
     last factor and floor with a `HorizonWarning`. States that were never logged, as velocities
     estimated by a smoother, keep their `std`, and their bands are infinite.
 
-    `trajlearn.dynamics._conformal` says how the bands are made, with references.
+    `trajlearn.dynamics._uncertainty.conformal` says how the bands are made, with references.
 
     Examples
     --------

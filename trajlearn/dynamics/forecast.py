@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
 
-from trajlearn.dynamics._conformal import half_widths
 from trajlearn.dynamics._joined_forecasts import PER_FORECAST, joined
 from trajlearn.dynamics._shared_states import shared_states
+from trajlearn.dynamics._uncertainty.conformal import half_widths
 from trajlearn.trajectories import TrajectoryDataset
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from trajlearn._sklearn import Interval, StrOptions, fit_context
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics._recurrent import Stepper
-from trajlearn.dynamics._rolling import RollingEstimator
-from trajlearn.dynamics._rollout import Step
+from trajlearn.dynamics._rollouts.rolling import RollingEstimator
+from trajlearn.dynamics._rollouts.rollout import Step
 from trajlearn.dynamics._sequence import SequenceLearner
 from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.trajectories import TrajectoryDataset, TransitionRelabeler

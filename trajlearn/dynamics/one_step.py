@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import Interval, StrOptions
-from trajlearn.dynamics._denoised import DenoisedEstimator
+from trajlearn.dynamics._denoising.denoised import DenoisedEstimator
 from trajlearn.dynamics._forecaster import Prediction, Request
 from trajlearn.dynamics._learner import (
     FullMoments,
@@ -19,14 +19,14 @@ from trajlearn.dynamics._learner import (
     own_moments_of,
     required,
 )
-from trajlearn.dynamics._propagation_gaussians import TransitionStep, roll_gaussians
-from trajlearn.dynamics._propagation_gp import gp_moments, has_exact_moments
-from trajlearn.dynamics._propagation_particles import drawn_step, expected_step, member_step
-from trajlearn.dynamics._propagation_steps import Image, linearised, mean_only, unscented
 from trajlearn.dynamics._query import Query
-from trajlearn.dynamics._rollout import Floats, InputRows, Step
-from trajlearn.dynamics._unrolled import check_unrollable, train_on_rollouts
+from trajlearn.dynamics._rollouts.rollout import Floats, InputRows, Step
+from trajlearn.dynamics._rollouts.unrolled import check_unrollable, train_on_rollouts
 from trajlearn.dynamics.propagation import BY_GAUSSIANS, PROPAGATIONS
+from trajlearn.dynamics.propagation._gaussians import TransitionStep, roll_gaussians
+from trajlearn.dynamics.propagation._gp import gp_moments, has_exact_moments
+from trajlearn.dynamics.propagation._particles import drawn_step, expected_step, member_step
+from trajlearn.dynamics.propagation._steps import Image, linearised, mean_only, unscented
 from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 from trajlearn.trajectories import TrajectoryDataset, TransitionRelabeler

@@ -13,24 +13,24 @@ from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import Interval, StrOptions, fit_context
-from trajlearn.dynamics._assessment import (
+from trajlearn.dynamics._episode_arguments import in_groups
+from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES
+from trajlearn.dynamics._meta import MetaForecaster
+from trajlearn.dynamics._selection.assessment import (
     assess_all,
     errors_in_ranges,
     held_out_folds,
     states_of,
     units_of,
 )
-from trajlearn.dynamics._conformal import steps_of
-from trajlearn.dynamics._default_members import default_members
-from trajlearn.dynamics._episode_arguments import in_groups
-from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES
-from trajlearn.dynamics._held_out_noise import HeldOutNoise, noise_of
-from trajlearn.dynamics._horizon_choice import Choice, blend, pick, step_weights
-from trajlearn.dynamics._horizon_losses import HorizonLosses
-from trajlearn.dynamics._meta import MetaForecaster
-from trajlearn.dynamics._mixed_forecast import Part, cut_after, mixed, shortened
-from trajlearn.dynamics._named_members import NamedMembers, checked_members, with_policy
-from trajlearn.dynamics._selection_evidence import ReportsSelection
+from trajlearn.dynamics._selection.choice import Choice, blend, pick, step_weights
+from trajlearn.dynamics._selection.default_members import default_members
+from trajlearn.dynamics._selection.evidence import ReportsSelection
+from trajlearn.dynamics._selection.held_out_noise import HeldOutNoise, noise_of
+from trajlearn.dynamics._selection.losses import HorizonLosses
+from trajlearn.dynamics._selection.mixed_forecast import Part, cut_after, mixed, shortened
+from trajlearn.dynamics._selection.named_members import NamedMembers, checked_members, with_policy
+from trajlearn.dynamics._uncertainty.conformal import steps_of
 from trajlearn.dynamics.distilled import DistilledForecaster
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.exceptions import DivergenceWarning

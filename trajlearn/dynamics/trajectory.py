@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from trajlearn._sklearn import HasMethods, Interval, StrOptions
 from trajlearn.dynamics._base import TwoDoorRegressor
-from trajlearn.dynamics._correlated_noise import correlated_noise, correlation_time
 from trajlearn.dynamics._dynamics import DynamicsEstimator
 from trajlearn.dynamics._forecaster import Prediction, Request
 from trajlearn.dynamics._learner import mixture, required, spread, takes_weights
 from trajlearn.dynamics._query import Query, make_query
+from trajlearn.dynamics._uncertainty.correlated_noise import correlated_noise, correlation_time
 from trajlearn.dynamics.horizon import HorizonFeatures
 from trajlearn.dynamics.phase import PhaseFeatures
 from trajlearn.dynamics.scaling import BlockScaler

@@ -1,0 +1,1 @@
+"""Which of several forecasters to trust at which horizon: folds, losses, choice, report."""

@@ -1,0 +1,1 @@
+"""Residuals of held-out episodes, and what they say of the errors to come."""
