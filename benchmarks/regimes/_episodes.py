@@ -103,7 +103,7 @@ def _measured(ds: TrajectoryDataset, noise: Floats, rng: np.random.Generator) ->
 
 
 def _cartpole(regime: Regime, seed: int, n_test: int) -> Episodes:
-    env = _cart(regime.gains)
+    env = cart(regime.gains)
     unit = scale(regime.gains, regime.length)
     rng = _generator(seed)
     logs = [
@@ -126,7 +126,7 @@ def _cartpole(regime: Regime, seed: int, n_test: int) -> Episodes:
     )
 
 
-def _cart(gains: str) -> Cartpole:
+def cart(gains: str) -> Cartpole:
     if gains == "unstable":
         return Cartpole(gains, limit_scale=np.inf)
     return Cartpole(gains, redraw_terminated=True)
@@ -134,7 +134,7 @@ def _cart(gains: str) -> Cartpole:
 
 def scale(gains: str, length: int) -> Floats:
     """Standard deviation (d_s,) of the states without noise: the unit of all noise."""
-    some = _cart(gains).collect(_SCALE_EPISODES, length, random_state=_SCALE_SEED)
+    some = cart(gains).collect(_SCALE_EPISODES, length, random_state=_SCALE_SEED)
     return np.asarray(some.states.std(axis=0))
 
 

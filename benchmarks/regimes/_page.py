@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 
 from benchmarks.paper._command import Tables, markdown
+from benchmarks.regimes import _floor
 from benchmarks.regimes._members import RULES
 from benchmarks.regimes._regimes import DEVELOPMENT, FRESH, POLICIES
 from benchmarks.regimes._tables import EXACT, in_order
@@ -25,6 +26,9 @@ def report(system: str, tables: Tables) -> str:
     """The whole text of one system."""
     scores = tables[f"{system}-scores"]
     seeds = judged_seeds(scores)
+    floors = tables.get(f"{system}-floors")
+    if floors is not None:
+        floors = floors[floors["seed"].isin(seeds)].groupby("regime")[["cum", "reward"]].median()
     lines = [
         f"## {system}",
         "",
@@ -40,13 +44,22 @@ def report(system: str, tables: Tables) -> str:
         some = scores[(scores["policy"] == policy) & scores["seed"].isin(seeds)]
         if some.empty:
             continue
-        lines += [f"### Policy {policy}: cumulated error", "", markdown(wide(system, some, "cum"))]
+        known = floors if policy == "known" else None
+        lines += [f"### Policy {policy}: cumulated error", ""]
+        lines += [markdown(wide(system, some, "cum", known)), ""]
         if some["reward"].notna().any():
-            lines += ["", f"### Policy {policy}: squared error of the mean reward", ""]
-            lines += [markdown(wide(system, some, "reward"))]
-        lines += [""]
+            lines += [f"### Policy {policy}: squared error of the mean reward", ""]
+            lines += [markdown(wide(system, some, "reward", known)), ""]
+    if floors is not None:
+        lines += [
+            f"{_floor.NAME}: the simulator itself, without its process noise, under the known "
+            "policy, from the mean of where an episode may have started given the noisy "
+            "measurement. No model of the step can be expected to do better.",
+            "",
+        ]
     if system == "cartpole":
-        lines += ["### Goals", "", markdown(goals(scores[scores["seed"].isin(seeds)])), ""]
+        some = scores[scores["seed"].isin(seeds)]
+        lines += ["### Goals", "", markdown(goals(some, floors)), ""]
     ratios = tables.get(f"{system}-ratios")
     if ratios is not None:
         lines += [
@@ -83,7 +96,9 @@ def judged_seeds(scores: pd.DataFrame) -> list[int]:
     return sorted(fresh or run)
 
 
-def wide(system: str, scores: pd.DataFrame, column: str) -> pd.DataFrame:
+def wide(
+    system: str, scores: pd.DataFrame, column: str, floors: pd.DataFrame | None
+) -> pd.DataFrame:
     """A line a regime, a column a model: median over seeds; the spread of the pick."""
     table = scores.pivot_table(column, "regime", "model", aggfunc="median", sort=False)
     table = table.loc[in_order(system, table.index)]
@@ -93,11 +108,13 @@ def wide(system: str, scores: pd.DataFrame, column: str) -> pd.DataFrame:
         for low, high in zip(pick.min().loc[table.index], pick.max().loc[table.index])
     ]
     table.insert(list(table.columns).index("pick") + 1, "pick, spread", spread)
+    if floors is not None:
+        table[_floor.NAME] = floors[column].reindex(table.index)
     return table.reset_index()
 
 
-def goals(scores: pd.DataFrame) -> pd.DataFrame:
-    """What was to be reached, beside the pick and the best single member."""
+def goals(scores: pd.DataFrame, floors: pd.DataFrame | None) -> pd.DataFrame:
+    """What was to be reached, beside the pick, the best single model and the plant itself."""
     lines = []
     for (regime, policy), (cum, reward) in GOALS.items():
         some = scores[(scores["regime"] == regime) & (scores["policy"] == policy)]
@@ -108,8 +125,11 @@ def goals(scores: pd.DataFrame) -> pd.DataFrame:
         line = {"regime": regime, "policy": policy}
         line |= {"goal": f"{cum:.1g} / {reward:.1g}"}
         line |= {rule: _pair(over.loc[rule]) for rule in RULES if rule in over.index}
-        lines.append(line | {"best single": f"{best}: {_pair(over.loc[best])}"})
-    return pd.DataFrame(lines)
+        line["best single"] = f"{best}: {_pair(over.loc[best])}"
+        if floors is not None and regime in floors.index and policy == "known":
+            line[_floor.NAME] = _pair(floors.loc[regime])
+        lines.append(line)
+    return pd.DataFrame(lines).replace({np.nan: None})
 
 
 def _pair(line: "pd.Series[float]") -> str:

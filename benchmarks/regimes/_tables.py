@@ -46,7 +46,7 @@ def models_of(ours: Found, peers: Found) -> dict[Key, dict[str, dict[str, Any]]]
     return found
 
 
-def tables(system: str, ours: Found, peers: Found) -> dict[str, pd.DataFrame]:
+def tables(system: str, ours: Found, peers: Found, floors: Found) -> dict[str, pd.DataFrame]:
     """All tables of one system, by stem.
 
     Returns
@@ -55,7 +55,7 @@ def tables(system: str, ours: Found, peers: Found) -> dict[str, pd.DataFrame]:
         ``scores``: a line a model, regime, policy and seed: ``cum``, ``reward``, ``n_diverged``
         and mean errors by block of horizons; ``ratios``: see `ratios`; ``curves``: errors by
         horizon of some; ``choice``: what the pick consists of; ``fits``: seconds and noise by
-        member; ``peers``: settings, seconds and failures.
+        member; ``peers``: settings, seconds and failures; ``floors``: errors of the plant itself.
     """
     by_key = models_of(ours, peers)
     scores, curves, apart = [], [], []
@@ -76,6 +76,13 @@ def tables(system: str, ours: Found, peers: Found) -> dict[str, pd.DataFrame]:
         "choice": _choices(ours),
         "fits": _fits(ours),
         "peers": _peers(peers),
+        "floors": pd.DataFrame(
+            [
+                {name: asked[name] for name in ("regime", "seed")}
+                | {name: found["scores"][name] for name in ("cum", "reward")}
+                for asked, found in floors
+            ]
+        ),
     }
     return {f"{system}-{stem}": table for stem, table in found.items() if len(table)}
 

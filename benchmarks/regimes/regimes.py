@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 from benchmarks._results import read_json
 from benchmarks._sweep import Cell, _finished, _name
 from benchmarks.paper._command import Benchmark, Run, Tables, _save_png, read_tables
-from benchmarks.regimes import _members, _peers
+from benchmarks.regimes import _floor, _members, _peers
 from benchmarks.regimes._environments import interpreter
 from benchmarks.regimes._episodes import FLIGHT_STEPS, N_TEST
 from benchmarks.regimes._page import report
@@ -42,8 +42,10 @@ SEEDS = (*FRESH, *DEVELOPMENT)
 MBRL = ("clean", "noise 1 %", "noise 3 %", "noise 10 %", "process .02", "20 episodes, noise 3 %")
 
 
-def cells(system: str, mode: str, seed: int, peers: list[str]) -> tuple[list[Cell], list[Cell]]:
-    """Cells of our forecasters, and of the peers."""
+def cells(
+    system: str, mode: str, seed: int, peers: list[str]
+) -> tuple[list[Cell], list[Cell], list[Cell]]:
+    """Cells of our forecasters, of the peers, and of the plant itself."""
     chosen = [
         regime
         for (of, name), regime in REGIMES.items()
@@ -60,21 +62,26 @@ def cells(system: str, mode: str, seed: int, peers: list[str]) -> tuple[list[Cel
         for policy in regime.policies
         if peer != "mbrl-lib" or (policy == "known" and regime.name in MBRL)
     ]
-    return ours, others
+    floors = [
+        {"system": system, "regime": regime.name, "floor": _floor.NAME, "mode": mode, "seed": seed}
+        for regime in chosen
+        if _floor.has_floor(regime)
+    ]
+    return ours, others, floors
 
 
 def run(run: Run, *, peers: list[str], compute: bool) -> Tables:
     """Tables of one system, from cells that are computed, or from those that are there."""
     assert run.task is not None  # a benchmark with tasks
-    own: Found = []
-    theirs: Found = []
+    own, theirs, floors = Found(), Found(), Found()
     if compute:
         for environment in filter(None, (_peers.ENVIRONMENT[peer] for peer in peers)):
             interpreter(environment)
     # a run that is stopped has whole seeds
     for seed in run.seeds:
-        ours, others = cells(run.task, run.mode, seed, peers)
+        ours, others, plants = cells(run.task, run.mode, seed, peers)
         for found, asked, function in (
+            (floors, plants, _floor.cell),
             (own, ours, _members.cell),
             (theirs, others, _peers.cell),
         ):
@@ -84,7 +91,7 @@ def run(run: Run, *, peers: list[str], compute: bool) -> Tables:
                 found += stored(run, asked, function)
     if not own:
         raise SystemExit(f"There are no finished cells of {run.task}: run without --finished.")
-    return tables(run.task, own, theirs)
+    return tables(run.task, own, theirs, floors)
 
 
 def stored(run: Run, cells: list[Cell], function: Callable[..., Any]) -> Found:

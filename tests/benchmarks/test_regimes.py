@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.regimes import _members, _peers, regimes
+from benchmarks.regimes import _floor, _members, _peers, regimes
 from benchmarks.regimes._episodes import episodes, scale
 from benchmarks.regimes._members import HeldOut, folds_of, recorded
 from benchmarks.regimes._peers import ROOT, Remote, Rows, candidates, limits_of, roll_out
@@ -319,11 +319,37 @@ def test_the_gp_is_exact_on_what_is_linear(monkeypatch):
     np.testing.assert_allclose(gp.step(rows.states, rows.inputs), rows.after, atol=2e-3)
 
 
+# -- the plant itself ---------------------------------------------------------------------
+
+
+def test_the_plant_starts_from_what_the_measurement_leaves_possible():
+    data = episodes(Regime("some", noise=0.3, **SMALL), 3, "quick")
+    first = data.test.offsets[:-1]
+    true, measured = (ds.states[first] for ds in (data.truth, data.test))
+    likely = _floor.likely_starts(data, Cartpole()).states[first]
+    off = [((some - true) ** 2).mean(axis=0) for some in (likely, measured)]
+    assert (off[0] < off[1]).all()
+    exact = episodes(Regime("some", **SMALL), 3, "quick")
+    same = _floor.likely_starts(exact, Cartpole())
+    np.testing.assert_allclose(same.states, exact.test.states, atol=1e-9)
+
+
+def test_the_plant_is_better_than_the_plant_from_the_measured_start():
+    what = REGIMES["cartpole", "noise 10 %"]
+    found = _floor.cell("cartpole", what.name, "plant", "quick", 3)
+    data = episodes(what, 3, "quick")
+    wide = np.array([[-1e9] * 4, [1e9] * 4])
+    naive = scores(roll_out(Exact(), data.test, wide, data.policy), data)
+    assert 0 < found["scores"]["cum"] < naive["cum"]
+
+
 # -- the command --------------------------------------------------------------------------
 
 
 def test_cells_of_a_seed():
-    ours, others = cells("cartpole", "full", 10, ["PySINDy", "mbrl-lib"])
+    ours, others, floors = cells("cartpole", "full", 10, ["PySINDy", "mbrl-lib"])
+    assert {"noise 3 %", "process .02"} <= {cell["regime"] for cell in floors}
+    assert not {"clean", "positions only", "logged every 5"} & {cell["regime"] for cell in floors}
     assert {cell["seed"] for cell in ours + others} == {10}
     assert len(ours) == sum(system == "cartpole" for system, _ in REGIMES)
     slow = [cell for cell in others if cell["peer"] == "mbrl-lib"]
