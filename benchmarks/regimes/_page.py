@@ -28,14 +28,20 @@ def report(system: str, tables: Tables) -> str:
     seeds = judged_seeds(scores)
     floors = tables.get(f"{system}-floors")
     if floors is not None:
-        floors = floors[floors["seed"].isin(seeds)].groupby("regime")[["cum", "reward"]].median()
+        floors = (
+            floors[floors["seed"].isin(seeds)]
+            .groupby("regime")[["cum", "typical", "reward"]]
+            .median()
+        )
     lines = [
         f"## {system}",
         "",
         f"Seeds {', '.join(map(str, seeds))}"
         + (" (fresh: nothing was chosen on them)." if set(seeds) <= set(FRESH) else ".")
         + " Errors are squared, in ranges of the training states, against the true test states "
-        "(real flights: the logged ones); cumulated: mean over test episodes and horizons. "
+        "(real flights: the logged ones); cumulated: mean over test episodes and horizons, which "
+        "one or two episodes at the edge of stability may decide; typical: median over episodes, "
+        "averaged over horizons. "
         "Median over seeds (least to greatest). A model that diverges has an infinite error; "
         "a blank was not run.",
         "",
@@ -47,6 +53,8 @@ def report(system: str, tables: Tables) -> str:
         known = floors if policy == "known" else None
         lines += [f"### Policy {policy}: cumulated error", ""]
         lines += [markdown(wide(system, some, "cum", known)), ""]
+        lines += [f"### Policy {policy}: typical error", ""]
+        lines += [markdown(wide(system, some, "typical", known)), ""]
         if some["reward"].notna().any():
             lines += [f"### Policy {policy}: squared error of the mean reward", ""]
             lines += [markdown(wide(system, some, "reward", known)), ""]

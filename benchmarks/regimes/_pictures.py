@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 #: Columns of the map, by group, and how they are called.
 COLUMNS = {
-    "poly1": "polynomial 1",
-    "poly3": "polynomial 3",
+    "poly1": "linear",
+    "poly3": "cubic",
     "network": "network",
-    "poly1_em": "polynomial 1",
-    "poly3_em": "polynomial 3",
+    "poly1_em": "linear",
+    "poly3_em": "cubic",
     "network_em": "network",
     "poly1_latent": "latent velocities",
     "poly1_window": "5 past states",
@@ -35,7 +35,7 @@ COLUMNS = {
     "GP": "GP",
     "pick": "selector",
 }
-_GROUPS = {"one-step": 3, "denoised": 3, "polynomial 1": 3, "with θ": 2, "peers": 4, "": 1}
+_GROUPS = {"one-step": 3, "denoised": 3, "linear": 3, "with θ": 2, "peers": 4, "": 1}
 #: Short names of models in cells.
 _SHORT = {
     "poly1": "P1",
@@ -54,19 +54,25 @@ _SHORT = {
 # ratios from which a cell is as dark as it gets
 _DARKEST = 100.0
 _NOT_RUN = "////"
+_ERRORS = {
+    "typical": "squared error, median over episodes, averaged over horizons",
+    "cum": "squared error, averaged over episodes and horizons",
+}
 
 
-def who_wins(scores: dict[str, pd.DataFrame]) -> "Figure":
-    """Regimes by models: cumulated error over that of the best single model of the regime.
+def who_wins(scores: dict[str, pd.DataFrame], error: str) -> "Figure":
+    """Regimes by models: error over that of the best single model of the regime.
 
     Parameters
     ----------
     scores : dict of DataFrame
         Of each system.
+    error : {"typical", "cum"}
+        A column of them.
     """
     import matplotlib.pyplot as plt
 
-    by_policy = {policy: _ratios(scores, policy) for policy in POLICIES}
+    by_policy = {policy: _ratios(scores, policy, error) for policy in POLICIES}
     by_policy = {policy: table for policy, table in by_policy.items() if len(table)}
     n_rows = [len(table) for table in by_policy.values()]
     figure, axes = plt.subplots(
@@ -81,21 +87,21 @@ def who_wins(scores: dict[str, pd.DataFrame]) -> "Figure":
         _draw_map(ax, table)
         ax.set_title(f"policy {policy}", loc="left", fontsize=11, pad=18)
     figure.supxlabel(
-        "cumulated error / that of the best single model of the row (framed), median over seeds; "
-        "hatched: not run",
+        f"{_ERRORS[error]} / that of the best single model of the row (framed)\n"
+        "median over seeds; hatched: not run",
         fontsize=9,
     )
     return figure
 
 
-def _ratios(scores: dict[str, pd.DataFrame], policy: str) -> pd.DataFrame:
-    """Cumulated error of each model (columns) over the least of a single one, by regime."""
+def _ratios(scores: dict[str, pd.DataFrame], policy: str, error: str) -> pd.DataFrame:
+    """Error of each model (columns) over the least of a single one, by regime."""
     tables = []
     for system, table in scores.items():
         some = table[(table["policy"] == policy) & table["seed"].isin(judged_seeds(table))]
         if some.empty:
             continue
-        cum = some.pivot_table("cum", "regime", "model", aggfunc="median", sort=False)
+        cum = some.pivot_table(error, "regime", "model", aggfunc="median", sort=False)
         cum = cum.loc[in_order(system, cum.index)].clip(lower=EXACT)
         single = cum.drop(columns=list(RULES), errors="ignore").min(axis=1)
         cum.index = [_row_label(system, name) for name in cum.index]
@@ -261,6 +267,7 @@ def _name(model: str) -> str:
         "network_em": "the same, denoised",
         "poly3": "one-step polynomial",
         "poly3_em": "the same, denoised ",
+        "poly1_latent": "linear, latent velocities",
     }.get(model, model)
 
 

@@ -25,7 +25,12 @@ CURVES = {
     "quadrotor": ("clean", "noise 3 %"),
     "flights": ("real flights",),
 }
-CURVE_MODELS = ("T", "C", "network", "network_em", "poly3", "poly3_em", "PySINDy", "GP", "pick")
+CURVE_MODELS = (
+    *("T", "C", "network", "network_em", "poly3", "poly3_em", "poly1_latent"),
+    *("PySINDy", "GP", "pick"),
+)
+# of the blocks, as shares of all horizons
+_WIDTHS = np.diff([0.0, *BLOCK_ENDS])
 BLOCKS = [f"block_{i}" for i in range(1, len(BLOCK_ENDS) + 1)]
 
 # (asked, found) of cells
@@ -52,8 +57,9 @@ def tables(system: str, ours: Found, peers: Found, floors: Found) -> dict[str, p
     Returns
     -------
     dict of DataFrame
-        ``scores``: a line a model, regime, policy and seed: ``cum``, ``reward``, ``n_diverged``
-        and mean errors by block of horizons; ``ratios``: see `ratios`; ``curves``: errors by
+        ``scores``: a line a model, regime, policy and seed: ``cum``, ``reward``, ``n_diverged``,
+        and the median error over episodes, averaged over all horizons (``typical``) and over
+        those of a block; ``ratios``: see `ratios`; ``curves``: errors by
         horizon of some; ``choice``: what the pick consists of; ``fits``: seconds and noise by
         member; ``peers``: settings, seconds and failures; ``floors``: errors of the plant itself.
     """
@@ -63,6 +69,7 @@ def tables(system: str, ours: Found, peers: Found, floors: Found) -> dict[str, p
         key = {"regime": regime, "policy": policy, "seed": seed}
         for model, some in models.items():
             line = {name: some[name] for name in ("cum", "reward", "n_diverged")}
+            line["typical"] = typical(some)
             blocks = dict(zip(BLOCKS, some["blocks"], strict=True))
             scores.append(key | {"model": model} | line | blocks)
             if regime in CURVES[system] and model in CURVE_MODELS:
@@ -80,11 +87,17 @@ def tables(system: str, ours: Found, peers: Found, floors: Found) -> dict[str, p
             [
                 {name: asked[name] for name in ("regime", "seed")}
                 | {name: found["scores"][name] for name in ("cum", "reward")}
+                | {"typical": typical(found["scores"])}
                 for asked, found in floors
             ]
         ),
     }
     return {f"{system}-{stem}": table for stem, table in found.items() if len(table)}
+
+
+def typical(scores: dict[str, Any]) -> float:
+    """Median error over episodes, averaged over all horizons."""
+    return float(np.average(scores["blocks"], weights=_WIDTHS))
 
 
 def ratios(models: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:

@@ -129,7 +129,10 @@ def draw(tables: Tables) -> "dict[str, Figure]":
     """Figures of one system."""
     system = _system(tables)
     scores = {system: tables[f"{system}-scores"]}
-    found = {f"{system}-who-wins": who_wins(scores), f"{system}-winners": winners(scores)}
+    found = {
+        f"{system}-who-wins": who_wins(scores, "typical"),
+        f"{system}-winners": winners(scores),
+    }
     if f"{system}-curves" in tables:
         found[f"{system}-curves"] = curves(system, tables[f"{system}-curves"])
     if f"{system}-ratios" in tables:
@@ -188,7 +191,8 @@ class Regimes(Benchmark):
         page = "\n".join(report(name, some) for name, some in every.items())
         (folder / f"{self.name}.md").write_text(page.rstrip() + "\n", encoding="utf-8")
         scores = {name: some[f"{name}-scores"] for name, some in every.items()}
-        save(who_wins(scores), folder / self.name, self.name)
+        save(who_wins(scores, "typical"), folder / self.name, self.name)
+        save(who_wins(scores, "cum"), folder / f"{self.name}-mean", self.name)
         save(winners(scores), folder / f"{self.name}-winners", self.name)
 
 

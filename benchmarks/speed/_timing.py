@@ -22,7 +22,12 @@ class Case:
 
 
 def measure(
-    cases: Sequence[Case], *, rounds: int, min_seconds: float = 0.0, **labels: Any
+    cases: Sequence[Case],
+    *,
+    rounds: int,
+    min_seconds: float = 0.0,
+    warm: bool = True,
+    **labels: Any,
 ) -> list[dict[str, Any]]:
     """Time the cases; the first is what the others are compared with.
 
@@ -36,6 +41,8 @@ def measure(
     rounds : int
     min_seconds : float
         Repeat a call within a round until it takes about this long.
+    warm : bool
+        Whether calls that are not timed go ahead; without, each is made once a round.
     **labels
         Copied into every row.
 
@@ -44,7 +51,7 @@ def measure(
     list of dict
         A row for each case: median and quartiles of seconds a unit and of the ratio.
     """
-    repeats = [_repeats(case.run, min_seconds) for case in cases]
+    repeats = [_repeats(case.run, min_seconds) if warm else 1 for case in cases]
     seconds = np.empty((rounds, len(cases)))
     with _without_garbage_collection():
         for k in range(rounds):
