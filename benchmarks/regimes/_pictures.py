@@ -128,7 +128,6 @@ def _draw_map(ax: "Axes", table: pd.DataFrame) -> None:
               norm=norm, aspect="auto")  # fmt: skip
     singles = [name not in RULES for name in table.columns]
     for i, row in enumerate(values):
-        best = np.nanmin(np.where(singles, row, np.inf))
         for j, value in enumerate(row):
             at = (j - 0.5, i - 0.5)
             if np.isnan(value):
@@ -137,7 +136,8 @@ def _draw_map(ax: "Axes", table: pd.DataFrame) -> None:
             dark = norm(min(max(value, 1.0), _DARKEST)) > 0.55
             ax.text(j, i, _number(value), ha="center", va="center", fontsize=7.5,
                     color="white" if dark else "black")  # fmt: skip
-            if singles[j] and value == best:
+            # a row whose best single model has no column has no frame
+            if singles[j] and value == 1.0:
                 inner = (j - 0.46, i - 0.44)
                 ax.add_patch(Rectangle(inner, 0.92, 0.88, fill=False, ec="black", lw=1.6))
     ax.set_yticks(range(len(table)), table.index, fontsize=8)

@@ -84,6 +84,19 @@ def test_diverged_members_end_at_the_ceiling():
     assert plot_selection(model).get_ylim()[1] == 100.0
 
 
+def test_lines_beyond_the_ceiling_are_shown_if_there_are_no_others():
+    members = [("far", Off(60.0, 60.0)), ("farther", Off(90.0, 90.0))]
+    model = HorizonSelector(members, random_state=0).fit(decays())
+    low, high = plot_selection(model).get_ylim()
+    least, greatest = model.cv_errors_["median"].agg(["min", "max"])
+    assert 100 < low < least < greatest < high
+
+
+def test_a_single_step_is_seen():
+    model = HorizonSelector([("one", Off(0.1))], random_state=0).fit(decays(steps=1))
+    assert lines(plot_selection(model))["one"].get_marker() == "."
+
+
 def test_it_draws_into_given_axes(selector):
     figure, ax = plt.subplots()
     assert plot_selection(selector, ax) is ax

@@ -148,6 +148,33 @@ def test_same_seed_same_bits_and_rows_alone():
     assert (law.predict(X[:1]) == law.predict(X)[:1]).all()
 
 
+@pytest.mark.parametrize(
+    ("fit", "message"),
+    [
+        ({"gains": [4]}, "gains = \\[4\\]: X has the columns 0 to 3"),
+        ({"gains": [-1]}, "X has the columns 0 to 3"),
+        ({"gains": [0.5]}, "must be a list of columns"),
+        ({"gains": [[1]]}, "must be a list of columns"),
+        ({"groups": [1, 2]}, "one label a row \\(20\\)"),
+    ],
+)
+def test_what_does_not_fit_the_rows_is_refused(fit, message):
+    X, y, _ = feedback(n=20)
+    with pytest.raises(ValueError, match=message):
+        ControlLawRegressor().fit(X, y, **fit)
+
+
+def test_a_gain_is_one_however_often_it_is_named():
+    X, y, label = feedback()
+    once, twice, none = (
+        ControlLawRegressor(tolerance=10).fit(X, y, groups=label, gains=gains)
+        for gains in ([2, 3], [3, 2, 3], [])
+    )
+    assert once.terms_ == twice.terms_
+    assert once.exact_.all()
+    assert not none.exact_.any()
+
+
 def test_weights_that_are_all_zero():
     X, y, _ = feedback(n=20)
     with pytest.raises(ValueError, match="at least one non-zero"):

@@ -75,13 +75,13 @@ def test_monomials_that_are_sums_of_others_do_no_harm(alpha):
     np.testing.assert_allclose(model.predict(X), np.sin(2 * angle), atol=1e-6)
 
 
-@pytest.mark.parametrize("degree", [0, -1, 2.5, True, "3"])
+@pytest.mark.parametrize("degree", [0, -1, 2.5, True, "3", None, [1], np.nan, np.inf])
 def test_a_degree_that_is_none_is_refused(degree):
     with pytest.raises(ValueError, match=r"degree = .* must be a whole number"):
         polynomial(degree)
 
 
-@pytest.mark.parametrize("alpha", [-1e-3, np.inf, np.nan])
+@pytest.mark.parametrize("alpha", [-1e-3, np.inf, np.nan, None, "1"])
 def test_a_penalty_that_is_none_is_refused(alpha):
     with pytest.raises(ValueError, match=r"alpha = .* must be finite and not negative"):
         polynomial(alpha=alpha)

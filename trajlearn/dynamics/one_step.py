@@ -9,30 +9,23 @@ from numpy.typing import NDArray
 from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import Interval, StrOptions
-from trajlearn.dynamics._denoising.denoised import DenoisedEstimator
-from trajlearn.dynamics._forecaster import Prediction, Request
-from trajlearn.dynamics._learner import (
-    FullMoments,
-    Moments,
-    by_member,
-    n_members_of,
-    own_moments_of,
-    required,
-)
-from trajlearn.dynamics._query import Query
-from trajlearn.dynamics._rollouts.rollout import Floats, InputRows, Step
+from trajlearn.dynamics._denoising.denoised import DenoisedEstimator, as_measured
 from trajlearn.dynamics._rollouts.unrolled import check_unrollable, train_on_rollouts
-from trajlearn.dynamics.propagation import BY_GAUSSIANS, PROPAGATIONS
-from trajlearn.dynamics.propagation._gaussians import TransitionStep, roll_gaussians
-from trajlearn.dynamics.propagation._gp import gp_moments, has_exact_moments
-from trajlearn.dynamics.propagation._particles import drawn_step, expected_step, member_step
-from trajlearn.dynamics.propagation._steps import Image, linearised, mean_only, unscented
+from trajlearn.dynamics.propagation import BY_GAUSSIANS
+from trajlearn.dynamics.propagation._gp import has_exact_moments
 from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 from trajlearn.trajectories import TrajectoryDataset, TransitionRelabeler
 from trajlearn.trajectories._layout import Layout
 
 __all__ = ["OneStepRegressor"]
+
+Floats = NDArray[np.float64]
+
+_NO_VELOCITIES = (
+    'policy_sees="measurements" does not go with latent_velocities=True: the log does not tell '
+    "which velocities the controller acted on. Leave one of the two out, and fit again."
+)
 
 
 class OneStepRegressor(DenoisedEstimator):
@@ -109,11 +102,12 @@ class OneStepRegressor(DenoisedEstimator):
     loss_horizon : int, default=1
         Steps of the roll-outs that the network is trained on after it has learned single steps:
         first of two steps, then four, eight, and so on up to this. They take actions from where
-        forecasts do: the policy if there is one, else the log. Makes it robust to noise in the
-        states (where `denoise` can be used, that is better and faster); without noise nothing is
-        gained. Each member keeps the weights of the round that forecasts `loss_horizon` steps of
-        training episodes best. Training takes time in proportion, and beyond about 25 steps
-        little is gained. For an `MLPEnsembleRegressor` behind a `BlockScaler`, on episodes.
+        forecasts do: the policy if there is one, else the log. For states with noise where
+        `denoise` cannot be used (with weights, or a `history`): the noise counts less in what is
+        learned from roll-outs, but a forecast still starts from the measured state. Each member
+        keeps the weights of the round that forecasts `loss_horizon` steps of training episodes
+        best. Training takes time in proportion. For an `MLPEnsembleRegressor` behind a
+        `BlockScaler`, on episodes.
     loss_discount : float, default=0.95
         Weight of a step of a roll-out, in that of the step before.
     propagation : {"tsinf", "ts1", "expectation", "moment", "unscented"}, default="tsinf"
@@ -205,7 +199,6 @@ class OneStepRegressor(DenoisedEstimator):
         "policy_sees": [StrOptions({"states", "measurements"})],
         "loss_horizon": [Interval(Integral, 1, None, closed="left")],
         "loss_discount": [Interval(Real, 0, 1, closed="right")],
-        "propagation": [StrOptions(set(PROPAGATIONS))],
     }
 
     def __init__(
@@ -269,12 +262,6 @@ class OneStepRegressor(DenoisedEstimator):
             )
         return super()._layout_of_rows(n_features, n_targets)
 
-    def _fit_rows(self, rows: Floats, targets: Floats, weight: Floats | None, groups: Any) -> None:
-        if "previous" in self.layout_:
-            actions = rows[:, self.layout_["action"]]
-            self.action_range_ = np.stack([actions.min(axis=0), actions.max(axis=0)])
-        super()._fit_rows(rows, targets, weight, groups)
-
     def _fit_door_of_rows(self, X: Any, y: Any, sample_weight: Any, groups: Any) -> None:
         if self.loss_horizon > 1:
             raise ValueError(
@@ -298,10 +285,7 @@ class OneStepRegressor(DenoisedEstimator):
         if self.policy_sees == "states":
             return
         if self.latent_velocities:
-            raise ValueError(
-                'policy_sees="measurements" does not go with latent_velocities=True: the log does '
-                "not tell which velocities the controller acted on. Leave one of the two out."
-            )
+            raise ValueError(_NO_VELOCITIES)
         if self.denoise is None:
             raise ValueError(
                 'policy_sees="measurements" needs to know how noisy they are: set denoise="em", or '
@@ -313,91 +297,31 @@ class OneStepRegressor(DenoisedEstimator):
     ) -> None:
         # actions are a function of what the controller acted on: the measurements in the log, or
         # the states behind them
-        if self.policy_sees == "states" and getattr(self, "noisy_", False):
+        if self.policy_sees == "measurements":
+            ds = as_measured(ds)
+        elif self._is_latent() or getattr(self, "noisy_", False):
             ds = self.smooth(ds)
         super()._fit_policy(ds, weight, groups)
 
     # -- forecasting ----------------------------------------------------------------------
 
-    def _step(self, query: Query, copies: int, rng: np.random.Generator | None) -> Step:
-        if rng is None:
-            return expected_step(self._moments(means_only=True))
-        if self.propagation == "expectation":
-            return drawn_step(self._full(self._moments()), rng)
-        n_members = n_members_of(self.estimator_)
-        moments = by_member(self._full(self._own_moments()), n_members)
-        if self.propagation == "ts1":
-            return member_step(moments, n_members, rng)
-        member = np.repeat(rng.permutation(np.arange(copies) % n_members), len(query))
-        return member_step(moments, member, rng)
-
-    def _own_moments(self) -> Moments:
-        """Function from raw rows of each member's own (E, n, k) to means and variances."""
-        learner = own_moments_of(self.estimator_)
-
-        def moments(rows: Floats) -> tuple[Floats, Floats | None]:
-            scaled = self._scaled(rows.reshape(-1, rows.shape[-1]))
-            means, variances = learner(scaled.reshape(*rows.shape[:2], -1))
-            known = np.zeros_like(means) if variances is None else variances
-            means, known = self._restore(rows, means, known)
-            return means, None if variances is None else known
-
-        return self._with_process_noise(moments)
-
-    def _full(self, moments: Moments, *, needed: bool = True) -> FullMoments:
-        """The same with variances, which are zero where there are none and none is `needed`."""
-
-        def full(rows: Floats) -> tuple[Floats, Floats]:
-            means, variances = moments(rows)
-            if variances is None and not needed:
-                return means, np.zeros_like(means)
-            return means, required(variances, self.estimator_)
-
-        return full
-
-    def _rolled_out(self, query: Query, request: Request, inputs: InputRows) -> Prediction:
-        if self.propagation not in PROPAGATIONS:
-            # fit has checked it, but it may have been set since
-            raise ValueError(
-                f"propagation = {self.propagation!r}; choose one of {sorted(PROPAGATIONS)}."
-            )
-        if self.propagation not in BY_GAUSSIANS:
-            return super()._rolled_out(query, request, inputs)
-        if self._history() > 1:
-            raise ValueError(
-                f"propagation={self.propagation!r} carries a Gaussian of one state, and "
-                f'history={self._history()} shows the model several: use propagation="tsinf", '
-                '"ts1" or "expectation".'
-            )
-        initial, n_samples = query.initial_states, request.n_samples or 0
-        uncertain = request.return_std or bool(n_samples)
-        if "previous" in self.layout_:
-            # what stands for an action before the start is not read
-            before = np.zeros((len(query), len(self.layout_.columns["previous"])))
-            initial = np.concatenate([initial, before], axis=1)
-        root = query.start_root
-        if root is not None:
-            wider = initial.shape[1] - root.shape[-1]
-            root = np.pad(root, ((0, 0), (0, wider), (0, wider)))
-        rolled = roll_gaussians(
-            initial,
-            query.n_steps,
-            n_members_of(self.estimator_),
-            self._transition(inputs, uncertain=uncertain),
-            self._limits(),
-            initial_root=root,
-            n_samples=n_samples,
-            rng=request.rng,
-        )
-        std = rolled.std if request.return_std else None
-        return Prediction(rolled.mean, std, rolled.samples)
+    def _has_exact_moments(self) -> bool:
+        # those of the learner are without the process noise
+        return has_exact_moments(self.estimator_) and getattr(self, "noise_", None) is None
 
     def _unseen_by(self, source: str) -> Floats | None:
         if source != "policy" or self.policy_sees == "states":
             return None
         # fit has checked it, but it may have been set since
         self._check_sight()
-        check_is_fitted(self, "measurement_noise_")
+        if self._is_latent():
+            raise ValueError(_NO_VELOCITIES)
+        check_is_fitted(
+            self,
+            "measurement_noise_",
+            msg='policy_sees="measurements" was set after a fit that did not look for measurement '
+            'noise: fit again with denoise="em".',
+        )
         if not self.measurement_noise_.any():
             return None
         if self.propagation in BY_GAUSSIANS:
@@ -406,28 +330,3 @@ class OneStepRegressor(DenoisedEstimator):
                 '(policy_sees="measurements"): use "tsinf", "ts1" or "expectation".'
             )
         return self.measurement_noise_
-
-    def _transition(self, inputs: InputRows, *, uncertain: bool) -> TransitionStep:
-        """Step of the members' Gaussians."""
-        moments = self._full(self._own_moments(), needed=uncertain)
-        image = Image(inputs, moments, self._limits(), carries="previous" in self.layout_)
-        width = self._widths()
-        if self.propagation == "unscented":
-            return unscented(image, len(width))
-        if has_exact_moments(self.estimator_) and getattr(self, "noise_", None) is None:
-            return gp_moments(
-                self.estimator_,
-                image,
-                self._scaled,
-                width,
-                target_scale=self.target_scale_,
-                change=self.target == "change",
-            )
-        return linearised(image, width) if uncertain else mean_only(image)
-
-    def _widths(self) -> Floats:
-        """Training range of each number of a point: state, and action before if it is an input."""
-        width = np.ptp(self.rolled_range_, axis=0)
-        if "previous" in self.layout_:
-            width = np.concatenate([width, np.ptp(self.action_range_, axis=0)])
-        return np.where(width > 0, width, 1.0)

@@ -1,7 +1,5 @@
 """Forecasts by the formulation that is best at each horizon, judged on held-out episodes."""
 
-import warnings
-from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any, ClassVar, Self
 
@@ -9,57 +7,30 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from sklearn.frozen import FrozenEstimator
 from sklearn.utils import check_random_state
-from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import Interval, StrOptions, fit_context
 from trajlearn.dynamics._episode_arguments import in_groups
 from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES
-from trajlearn.dynamics._meta import MetaForecaster
-from trajlearn.dynamics._selection.assessment import (
-    assess_all,
-    errors_in_ranges,
-    held_out_folds,
-    states_of,
-    units_of,
-)
+from trajlearn.dynamics._selection.assessment import assess_all, errors_in_ranges, states_of
 from trajlearn.dynamics._selection.choice import Choice, blend, pick, step_weights
 from trajlearn.dynamics._selection.default_members import default_members
 from trajlearn.dynamics._selection.evidence import ReportsSelection
+from trajlearn.dynamics._selection.folds import held_out_folds, units_of
+from trajlearn.dynamics._selection.forecasts_by_weights import ForecastsByWeights
 from trajlearn.dynamics._selection.held_out_noise import HeldOutNoise, noise_of
 from trajlearn.dynamics._selection.losses import HorizonLosses
-from trajlearn.dynamics._selection.mixed_forecast import Part, cut_after, mixed, shortened
-from trajlearn.dynamics._selection.named_members import NamedMembers, checked_members, with_policy
-from trajlearn.dynamics._uncertainty.conformal import steps_of
+from trajlearn.dynamics._selection.named_members import checked_members, with_policy
 from trajlearn.dynamics.distilled import DistilledForecaster
-from trajlearn.dynamics.forecast import Forecast
-from trajlearn.exceptions import DivergenceWarning
 from trajlearn.trajectories import TrajectoryDataset
-from trajlearn.trajectories._relabeler import generator
 from trajlearn.trajectories.times import median_step
 
 __all__ = ["HorizonSelector"]
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
-# asks a fitted member for a forecast of so many steps, with keywords
-Asked = Callable[..., Forecast]
 
 
-def _members_can(name: str) -> Callable[[Any], bool]:
-    """Check for `available_if`: whether the members have a method; those that are chosen do."""
-
-    def check(self: "HorizonSelector") -> bool:
-        members = list(self._named().values())
-        if hasattr(self, "weights_"):
-            used = np.flatnonzero(self.weights_.any(axis=0))
-            members = [self.estimators_[i] for i in used]
-        return all(hasattr(member, name) for member in members if not isinstance(member, str))
-
-    return check
-
-
-class HorizonSelector(ReportsSelection, NamedMembers, MetaForecaster):
+class HorizonSelector(ReportsSelection, ForecastsByWeights):
     """Fits several formulations and forecasts by the one that is best at each horizon.
 
     No formulation wins everywhere: a one-step model is ahead where the whole state is measured
@@ -88,7 +59,7 @@ class HorizonSelector(ReportsSelection, NamedMembers, MetaForecaster):
         default members None is "clone": they learn it from the logged actions.
     cv : int, splitter or iterable of (train, test), default=4
         Folds of whole episodes (of groups, where there are); up to five episodes are left out one
-        by one.
+        by one. Your own folds may hold out an episode once at most, and train on others only.
     rule : {"pick", "blend"}, default="pick"
     margin : float, default=1.0
         Standard errors by which another member must be better at a horizon.
@@ -253,7 +224,8 @@ class HorizonSelector(ReportsSelection, NamedMembers, MetaForecaster):
         TypeError
             If `X` is rows, or a member predicts no `Forecast`.
         ValueError
-            If there is one episode or group only; if members forecast different states.
+            If there is one episode or group only; if a fold of `cv` is empty, trains on what it
+            holds out, or holds out what another one does; if members forecast different states.
         """
         ds = in_groups(self._episodes(X, y), groups)
         seed = check_random_state(self.random_state).randint(2**31, size=4)
@@ -305,149 +277,6 @@ class HorizonSelector(ReportsSelection, NamedMembers, MetaForecaster):
         # as in the losses, who has diverged is this far off
         finite = np.clip(residuals, -DIVERGENCE_RANGES, DIVERGENCE_RANGES)
         return blend(losses, finite, self.margin, self.n_blended, self.bandwidth)
-
-    # -- prediction -----------------------------------------------------------------------
-
-    def predict(
-        self,
-        X: Any,
-        return_std: bool = False,
-        *,
-        start: ArrayLike = 0,
-        horizon: int | None = None,
-        actions: str = "auto",
-        policy: Any = None,
-        n_samples: int | None = None,
-        random_state: Any = None,
-    ) -> Forecast:
-        """Forecast episodes; each member once, to the longest horizon at which it has weight.
-
-        Parameters
-        ----------
-        X : TrajectoryDataset or list of Trajectory
-        return_std : bool, default=False
-        start, horizon, actions, policy, n_samples, random_state
-            As in `forecast` of the members.
-
-        Returns
-        -------
-        Forecast
-        """
-        check_is_fitted(self, "weights_")
-        ds = self._episodes(X)
-        n_steps = int(ds.lengths.max())
-        # members refuse a horizon that is none
-        if isinstance(horizon, (int, np.integer)) and horizon > 0:
-            n_steps = int(horizon)
-
-        def ask(member: Any, reach: int, **settings: Any) -> Forecast:
-            of, to = ds, horizon
-            if reach < n_steps and horizon is None:
-                of = cut_after(ds, start, reach)
-            elif reach < n_steps:
-                to = reach
-            return member.predict(
-                of, start=start, horizon=to, actions=actions, policy=policy, **settings
-            )
-
-        found = self._mixture(np.arange(n_steps), ask, return_std, n_samples, random_state)
-        source = self._source(found, actions, policy)
-        if source == "logged":
-            episode = np.arange(len(ds)) if found.episode is None else found.episode
-            found = shortened(found, ds.lengths[episode] - found.start)
-        return self._ranged(found._replace(actions=source))
-
-    @available_if(_members_can("predict_trajectory"))
-    def predict_trajectory(
-        self,
-        initial_states: ArrayLike,
-        *,
-        horizons: ArrayLike,
-        return_std: bool = False,
-        n_samples: int | None = None,
-        random_state: Any = None,
-        **signals: Any,
-    ) -> Forecast:
-        """Predict from states and known signals alone, without a dataset: for planning.
-
-        Parameters
-        ----------
-        initial_states : array-like of shape (n, d_s) or (d_s,)
-        horizons : array-like of shape (H,)
-            Times after the start. Who predicts each is chosen as at the next step at or after it.
-        return_std, n_samples, random_state
-            As in `predict`.
-        **signals
-            As in `predict_trajectory` of the members; they must agree on arrays by step.
-
-        Returns
-        -------
-        Forecast
-        """
-        check_is_fitted(self, "weights_")
-        wanted = np.atleast_1d(np.asarray(horizons, dtype=np.float64))
-        # arrays by step have as many rows as there are steps to the last horizon
-        whole = any(
-            signals.get(name) is not None and not callable(signals[name])
-            for name in ("actions", "references")
-        )
-
-        def ask(member: Any, reach: int, **settings: Any) -> Forecast:
-            some = wanted if whole else wanted[:reach]
-            return member.predict_trajectory(initial_states, horizons=some, **settings, **signals)
-
-        steps = steps_of(wanted, self._elapsed)
-        found = self._mixture(steps, ask, return_std, n_samples, random_state)
-        given = "auto" if signals.get("actions") is None else "logged"
-        source = self._source(found, given, signals.get("policy"))
-        return self._ranged(found._replace(actions=source))
-
-    def _mixture(
-        self, steps: Ints, ask: Asked, return_std: bool, n_samples: int | None, random_state: Any
-    ) -> Forecast:
-        """Mixture of the members that have weight at some of the steps (H,), counted from 0."""
-        weights = self.weights_[np.minimum(steps, len(self.weights_) - 1)]
-        rng = np.random.default_rng() if random_state is None else generator(random_state)
-        seeds = rng.integers(2**31, size=len(self.names_))
-        parts = []
-        for i in np.flatnonzero((weights > 0).any(axis=0)):
-            noise = self._noise[i]
-            settings: dict[str, Any] = {}
-            if random_state is not None or n_samples:
-                settings["random_state"] = int(seeds[i])
-            if noise is None:
-                settings |= {"return_std": return_std, "n_samples": n_samples}
-            reach = int(np.flatnonzero(weights[:, i])[-1]) + 1
-            with warnings.catch_warnings():
-                # told once for all members, below
-                warnings.simplefilter("ignore", DivergenceWarning)
-                found = ask(self.estimators_[i], reach, **settings)
-            parts.append(Part(found, weights[:, i], noise, steps))
-        forecast = mixed(parts, return_std=return_std, n_samples=n_samples, rng=rng)
-        if forecast.diverged_at.any():
-            gone = forecast.diverged_at[forecast.diverged_at > 0]
-            warnings.warn(
-                f"{len(gone)} of {len(forecast)} forecasts diverged (first at step {gone.min()}): "
-                "their states are inf from there on. report('member') says who diverged on "
-                "held-out episodes; clip_states= of one-step members bounds them.",
-                DivergenceWarning,
-                stacklevel=4,
-            )
-        return forecast
-
-    def _source(self, found: Forecast, actions: str, policy: Any) -> str:
-        """Where members take actions from, chosen ones or not: the same for all horizons."""
-        if set(self._sources) == {"none"}:
-            return "none"
-        if actions == "auto" and policy is None:
-            return "logged" if "logged" in self._sources else "policy"
-        if found.actions != "none":
-            return found.actions
-        return "policy" if actions == "auto" else actions
-
-    def _ends_with_log(self, ds: TrajectoryDataset, actions: str, policy: Any) -> bool:
-        asked = [getattr(member, "_ends_with_log", None) for member in self.estimators_]
-        return any(ends is not None and ends(ds, actions, policy) for ends in asked)
 
     def distill(
         self, X: Any, student: Any = None, *, random_state: Any = None, **settings: Any

@@ -32,7 +32,7 @@ def plot_selection(
     ax : matplotlib Axes, optional
         Default: a new figure.
     ceiling : float, default=100.0
-        Greatest squared error shown; a diverged forecast lies above any.
+        Greatest squared error shown, unless all are greater; a diverged forecast lies above any.
 
     Returns
     -------
@@ -65,17 +65,19 @@ def plot_selection(
     ax = axes_or_new(ax, "plot_selection", (6.4, 4.2 + 0.16 * len(names)))
     ax.set_xscale("log")
     ax.set_yscale("log", nonpositive="mask")
-    greatest = 0.0
+    least, greatest = np.inf, 0.0
+    alone = "." if len(steps) == 1 else None
     for i, name in enumerate(names):
         style: dict[str, Any] = line_style(i)
         median = np.minimum(table[name].to_numpy(dtype=np.float64), 1e12)
+        least = min(least, float(np.nanmin(median, initial=np.inf)))
         greatest = max(greatest, float(np.nanmax(median, initial=0.0)))
         used = weights[:, i] > _BROAD
-        ax.plot(steps, median, lw=1.8 if used.any() else 1.0, label=name, **style)
+        ax.plot(steps, median, lw=1.8 if used.any() else 1.0, label=name, marker=alone, **style)
         broad = np.where(used, median, np.nan)
         ax.plot(steps, broad, lw=7, alpha=0.3, color=style["color"], solid_capstyle="butt")
     if greatest > ceiling:
-        ax.set_ylim(top=ceiling)
+        ax.set_ylim(top=max(ceiling, 10 * least))
     ax.set_xlim(0.9, 1.04 * len(weights))
     ax.set_ylabel("squared error (training range = 1)\nmedian over held-out episodes")
     ax.tick_params(labelbottom=False)

@@ -1,6 +1,7 @@
 """Polynomial least squares: the honest baseline on smooth plants, fitted in milliseconds."""
 
 from collections.abc import Callable
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -57,13 +58,17 @@ def polynomial(degree: int = 3, *, alpha: float = 1e-6) -> Pipeline:
     >>> float(np.abs(model.predict(ds).mean - states[:, 1:]).max()) < 1e-6
     True
     """
-    if isinstance(degree, bool) or degree != int(degree) or degree < 1:
+    if not _is_number(degree) or degree < 1 or degree % 1:
         raise ValueError(f"degree = {degree!r} must be a whole number of at least 1.")
-    if not 0 <= alpha < np.inf:
+    if not _is_number(alpha) or not 0 <= alpha < np.inf:
         raise ValueError(f"alpha = {alpha!r} must be finite and not negative.")
     linear = Ridge(alpha=float(alpha)) if alpha else LinearRegression()
     features = PolynomialFeatures(int(degree), include_bias=False)
     return Pipeline([("features", features), ("linear", linear)])
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool)
 
 
 def polynomial_predictor(learner: Any) -> Callable[[Floats], Floats] | None:

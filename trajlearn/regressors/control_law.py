@@ -171,14 +171,14 @@ class ControlLawRegressor(RegressorMixin, BaseEstimator):
             sample_weight, rows, dtype=np.float64, ensure_non_negative=True
         )
         keep = weight > 0
-        labels = None if groups is None else np.asarray(groups)[keep]
+        labels = None if groups is None else _labels(groups, len(rows))[keep]
         self._y_ndim = targets.ndim
         rows, targets = rows[keep], np.asarray(targets, dtype=np.float64)[keep]
         targets = targets.reshape(len(rows), -1)
         fold = _folds(np.concatenate([rows, targets], axis=1), labels)
         data = _Data(rows, targets, weight[keep], fold)
         self.limits_ = np.stack([targets.min(axis=0), targets.max(axis=0)])
-        product = _bilinear(rows.shape[1], [] if gains is None else np.asarray(gains).tolist())
+        product = _bilinear(rows.shape[1], _columns(gains, rows.shape[1]))
         laws = [self._law(data, j, product) for j in range(targets.shape[1])]
         self.terms_ = [law.terms for law in laws]
         self.ridges_ = [law.ridge for law in laws]
@@ -351,6 +351,27 @@ class _Data:
             return [(self, self)]
         judged = folds if self.is_small else folds[-1:]
         return [(self.at(self.fold != k), self.at(self.fold == k)) for k in judged]
+
+
+def _labels(groups: ArrayLike, n: int) -> NDArray[Any]:
+    labels = np.asarray(groups)
+    if labels.shape != (n,):
+        raise ValueError(f"groups has shape {labels.shape}; give one label a row ({n}).")
+    return labels
+
+
+def _columns(gains: ArrayLike | None, width: int) -> list[int]:
+    """Columns that hold gains, each once."""
+    if gains is None:
+        return []
+    columns = np.asarray(gains)
+    if not columns.size:
+        return []
+    if columns.ndim != 1 or columns.dtype.kind not in "iu":
+        raise ValueError(f"gains = {gains!r} must be a list of columns of X, whole numbers.")
+    if columns.min() < 0 or columns.max() >= width:
+        raise ValueError(f"gains = {columns.tolist()}: X has the columns 0 to {width - 1}.")
+    return sorted(set(columns.tolist()))
 
 
 def _bilinear(width: int, gains: list[int]) -> list[Term]:

@@ -1,5 +1,7 @@
 """Errors-in-variables training: noise that is told, slopes that are right, honest starts."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from sklearn.base import clone
@@ -8,10 +10,12 @@ from sklearn.linear_model import LinearRegression
 from tests.dynamics.noisy_systems import STD, A, B, noisy_linear
 from trajlearn import (
     BlockScaler,
+    GPRegressor,
     MLPEnsembleRegressor,
     OneStepRegressor,
     TrajectoryDataset,
     TrajectoryRegressor,
+    TransitionRelabeler,
     load,
 )
 from trajlearn.dynamics._denoising import errors_in_variables
@@ -98,6 +102,8 @@ def test_closed_loop_models_are_denoised():
     raw = denoised(polynomial(2), inputs="params", denoise=None).fit(ds)
     test = TrajectoryDataset.from_arrays(states, params=gains)
     assert model.score(test) > 0.2 * raw.score(test)
+    # its filter reads no actions, so none are needed before a start
+    assert model.predict(test, start=9).mean.shape == (40, 31, 1)
 
 
 # -- no noise: nothing is done ------------------------------------------------------------
@@ -135,7 +141,8 @@ def test_a_learner_that_misses_something_is_not_noise():
     assert not denoised(polynomial(1), inputs="params").fit(ds).noisy_
 
 
-@pytest.mark.parametrize("value", [0.0, 1.5])
+# the mean of many 0.1 is not 0.1, so that they seem to vary
+@pytest.mark.parametrize("value", [0.0, 1.5, 0.1])
 @pytest.mark.parametrize("learner", [None, SMALL_NETWORK], ids=["linear", "network"])
 def test_a_state_that_never_changes_does_no_harm(value, learner):
     states = [np.column_stack([e.states, np.full(e.length + 1, value)]) for e in MEASURED]
@@ -145,12 +152,23 @@ def test_a_state_that_never_changes_does_no_harm(value, learner):
     assert model.measurement_noise_[2] < 1e-6
     assert (model.smooth(ds).states[:, 2] == value).all()
     assert np.isfinite(model.predict(ds[:1], return_std=True, start=5, random_state=0).std).all()
+    # elsewhere than in training it is where it was measured
+    states = ds[0].states + np.array([0.0, 0.0, 5.0])
+    other = TrajectoryDataset.from_arrays([states], actions=[ds[0].actions])
+    np.testing.assert_allclose(model.predict(other, start=3).mean[0, :, 2], value + 5.0, atol=1e-3)
 
 
 def test_another_fit_without_it_forgets_the_noise(model):
     again = clone(model).fit(MEASURED).set_params(denoise=None).fit(MEASURED)
     assert not hasattr(again, "noise_")
     same(again.predict(TRUE), denoised(denoise=None).fit(MEASURED).predict(TRUE))
+
+
+def test_another_fit_on_rows_forgets_the_noise(model):
+    rows, targets = TransitionRelabeler().fit_resample(MEASURED)
+    again = clone(model).fit(MEASURED).set_params(denoise=None).fit(rows, targets)
+    assert not hasattr(again, "noise_")
+    same(again.predict(TRUE), denoised(denoise=None).fit(rows, targets).predict(TRUE))
 
 
 def test_the_same_seed_gives_the_same_bits(model):
@@ -167,6 +185,27 @@ def test_smoothed_states_are_near_the_true_ones(model):
     assert smooth.hindsight
     np.testing.assert_array_equal(smooth.observed, MEASURED.states)
     assert model.smooth(smooth) is smooth
+
+
+def test_smoothed_episodes_keep_their_other_fields(model):
+    more = MEASURED.assign(
+        rewards=[np.arange(e.length) for e in MEASURED], terminated=np.arange(50) % 3 == 0
+    )
+    smooth = model.smooth(more)
+    np.testing.assert_array_equal(smooth.rewards, more.rewards)
+    np.testing.assert_array_equal(smooth.terminated, more.terminated)
+
+
+def test_units_of_states_do_not_matter(model):
+    unit = np.array([1e6, 1e-6])
+    scaled = TrajectoryDataset.from_arrays(
+        [e.states * unit for e in MEASURED], actions=[e.actions for e in MEASURED]
+    )
+    other = denoised().fit(scaled)
+    np.testing.assert_allclose(other.measurement_noise_ / unit, model.measurement_noise_, rtol=0.01)
+    np.testing.assert_allclose(
+        other.predict(scaled, start=9).mean / unit, model.predict(MEASURED, start=9).mean, atol=0.01
+    )
 
 
 def test_episodes_are_smoothed_as_if_alone(model):
@@ -291,6 +330,14 @@ def test_std_is_that_of_the_start_and_of_the_process(model):
     )
     np.testing.assert_allclose(moment.std[0, 0], want, rtol=1e-4)
     np.testing.assert_allclose(moment.samples[:, 0, 0].std(axis=0), want, rtol=0.05)
+
+
+def test_moments_of_a_gp_have_the_process_noise_on_top(model):
+    noise = replace(model.noise_, process=np.array([1.0, 4.0]))
+    smooth = model.smooth(MEASURED[:3].truncate(15))
+    gp = denoised(GPRegressor(), propagation="moment")._fit_smoothed(smooth, noise)
+    std = gp.predict(MEASURED[:2], return_std=True, horizon=1).std
+    assert (std[:, 0] >= [1.0, 2.0]).all()
 
 
 def test_learners_without_variance_have_that_of_the_process():

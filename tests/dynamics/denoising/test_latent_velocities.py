@@ -9,6 +9,8 @@ from sklearn.base import clone
 from tests.dynamics.noisy_systems import oscillators
 from trajlearn import KalmanSmoother, OneStepRegressor, TrajectoryDataset
 from trajlearn.dynamics._denoising.latent_velocities import guessed_velocities, with_velocities
+from trajlearn.dynamics._denoising.start_filter import filtered_starts
+from trajlearn.dynamics._query import make_query
 from trajlearn.exceptions import MissingFieldError
 from trajlearn.regressors import polynomial
 
@@ -153,6 +155,17 @@ def test_a_position_that_never_changes_does_no_harm():
     np.testing.assert_allclose(model.predict(still, start=5).mean[..., 1], 1.0, atol=1e-3)
 
 
+def test_a_position_that_never_changes_is_not_noisy():
+    still = TrajectoryDataset.from_arrays(
+        [np.column_stack([e.states, np.full(e.length + 1, 0.1)]) for e in POSITIONS],
+        actions=[e.actions for e in POSITIONS],
+        dt=0.1,
+    )
+    model = latent(rollout_actions="logged", policy=None).fit(still)
+    assert not model.noisy_
+    assert (model.measurement_noise_ < 1e-4).all()
+
+
 def test_of_two_positions_both_are_forecast_from_filtered_starts():
     rng = np.random.default_rng(0)
     pushes = rng.normal(size=(20, 30, 2))
@@ -164,7 +177,11 @@ def test_of_two_positions_both_are_forecast_from_filtered_starts():
         v = v + 0.1 * (pushes[:, t] - 2.0 * x[:, t] + x[:, t, ::-1])
     ds = TrajectoryDataset.from_arrays(x, actions=pushes, dt=0.1)
     model = OneStepRegressor(polynomial(1), latent_velocities=True, random_state=0).fit(ds[:15])
-    np.testing.assert_allclose(model.predict(ds[15:], start=5).mean, x[15:, 6:], atol=0.01)
+    ahead = model.predict(ds[15:], start=5).mean
+    np.testing.assert_allclose(ahead, x[15:, 6:], atol=0.01)
+    # read in a fit
+    model.set_params(latent_velocities=False)
+    np.testing.assert_array_equal(model.predict(ds[15:], start=5).mean, ahead)
 
 
 @pytest.mark.parametrize("noise", [0.0, NOISE])
@@ -195,6 +212,23 @@ def test_what_is_set_after_a_fit_changes_no_fitted_step(model):
     again = clone(model).fit(POSITIONS[:10]).set_params(latent_velocities=False)
     assert again.predict(POSITIONS[:2], start=3).mean.shape == (2, 57, 1)
     assert again.smooth(POSITIONS[:2]).state_names == ("x", "d_x")
+    without = OneStepRegressor(polynomial(1)).fit(POSITIONS[:10])
+    before = without.predict(POSITIONS[:2], start=3).mean
+    without.set_params(latent_velocities=True)
+    np.testing.assert_array_equal(without.predict(POSITIONS[:2], start=3).mean, before)
+
+
+@pytest.mark.parametrize(("surprise", "elsewhere"), [(14.0, False), (16.5, True)])
+def test_a_start_is_judged_by_what_is_measured(noisy_model, surprise, elsewhere):
+    # a chi-squared number of one degree of freedom is above 15.1 once in 10,000
+    noise = noisy_model.noise_
+    total = noise.start_covariance[0, 0] + noise.measurement[0]
+    x = noise.start_mean[0] + np.sqrt(surprise * total)
+    ds = TrajectoryDataset.from_arrays([[[x], [x]]], actions=[[[0.0]]], dt=0.1)
+    query, _ = make_query(with_velocities(ds), 0, 1, within_log=True, within_stretch=False)
+    _, covariance = filtered_starts(noisy_model, query, noise)
+    known = noise.spread[1] if elsewhere else noise.start_covariance[1, 1]
+    assert covariance[0, 1, 1] == pytest.approx(known, rel=0.3)
 
 
 def test_guesses_are_differences_within_episodes():

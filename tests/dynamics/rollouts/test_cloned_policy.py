@@ -10,7 +10,13 @@ from sklearn.linear_model import LinearRegression
 from sklearn.neighbors import KNeighborsRegressor
 
 from tests.dynamics.systems import A, B, gain_policy, linear
-from trajlearn import LSTMRegressor, OneStepRegressor, TrajectoryDataset, load
+from trajlearn import (
+    LSTMRegressor,
+    OneStepRegressor,
+    TrajectoryDataset,
+    TransitionRelabeler,
+    load,
+)
 from trajlearn.exceptions import MissingFieldError
 from trajlearn.regressors.control_law import ControlLawRegressor
 
@@ -238,3 +244,40 @@ def test_a_second_fit_without_forgets_the_clone():
     fitted = model().fit(controlled())
     fitted.set_params(policy=None).fit(controlled())
     assert not hasattr(fitted, "policy_")
+
+
+def test_a_second_fit_on_rows_forgets_the_clone():
+    fitted = model().fit(controlled())
+    rows, targets = TransitionRelabeler().fit_resample(controlled())
+    fitted.set_params(policy=None).fit(rows, targets)
+    assert not hasattr(fitted, "policy_")
+
+
+@pytest.mark.parametrize(("n", "steps"), [(1, 15), (3, 1), (1, 1)])
+def test_few_and_short_episodes(n, steps):
+    ds = controlled(n, steps=steps)
+    forecast = model().fit(ds).predict(ds)
+    assert forecast.mean.shape == (n, steps, 2)
+    assert np.isfinite(forecast.mean).all()
+
+
+@pytest.mark.parametrize(("unit", "of_actions"), [(1e6, 1e-6), (1e-6, 1e6)])
+def test_units_do_not_matter(unit, of_actions):
+    scaled = [
+        TrajectoryDataset.from_arrays(
+            [e.states * unit for e in ds],
+            actions=[e.actions * of_actions for e in ds],
+            params=ds.params,
+        )
+        for ds in (controlled(), controlled(5, seed=1))
+    ]
+    fitted = model().fit(scaled[0])
+    assert fitted.policy_.estimator.exact_.all()
+    truth = scaled[1].states.reshape(5, 16, 2)[:, 1:]
+    assert_allclose(fitted.predict(scaled[1]).mean / unit, truth / unit, atol=1e-6)
+
+
+def test_a_controller_that_does_nothing():
+    ds = controlled(policy=lambda s, p, t: np.full((len(s), 1), 0.1))
+    cloned = model().fit(ds).policy_
+    assert_allclose(cloned(np.ones((3, 2)), np.ones((3, 2)), np.zeros(3)), 0.1)

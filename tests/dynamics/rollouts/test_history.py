@@ -193,3 +193,27 @@ def test_what_cannot_work_is_refused():
         )
     with pytest.raises(MissingFieldError):
         model(2, policy="clone").fit(without)
+
+
+@pytest.mark.parametrize("settings", [{"history": 3}, {"inputs": ("action", "previous")}])
+def test_past_actions_are_those_of_training(settings):
+    train, test = masses(), masses(4, seed=1)
+
+    def still(states, params, times):
+        return np.zeros((len(states), 2))
+
+    two = [np.hstack([e.actions, e.actions**2]) for e in train]
+    fitted = model(policy=still, **settings).fit(train.assign(actions=two))
+    assert fitted.predict(test, horizon=2).actions == "policy"
+    with pytest.raises(ValueError, match="have 1 actions, the model was fitted on 2"):
+        fitted.predict(test, start=5)
+    none = TrajectoryDataset.from_arrays([e.states for e in test], params=test.params, dt=DT)
+    with pytest.raises(MissingFieldError, match="no actions before the start"):
+        fitted.predict(none, start=5)
+
+
+def test_episodes_shorter_than_the_window():
+    short = masses(6, steps=2, shortest=1)
+    fitted = model(5).fit(short)
+    assert np.isfinite(fitted.predict(short, horizon=1).mean).all()
+    assert fitted.predict(short[short.lengths == 2], start=1).mean.shape[1:] == (1, 1)

@@ -6,8 +6,10 @@ from numpy.testing import assert_allclose
 from sklearn.exceptions import NotFittedError
 from sklearn.linear_model import LinearRegression
 
+from tests.dynamics.noisy_systems import oscillators
 from tests.dynamics.systems import A, B, gain_policy
 from trajlearn import OneStepRegressor, TrajectoryDataset
+from trajlearn.dynamics._denoising.errors_in_variables import with_states
 from trajlearn.dynamics._rollouts.noisy_sight import noisy_sight, paired
 
 NOISE = np.array([0.3, 0.2])
@@ -114,6 +116,13 @@ def test_clone_is_learned_from_what_the_controller_acted_on():
     assert_allclose(by_measurement.predict(true).mean, given.predict(true).mean, atol=1e-6)
 
 
+def test_clone_is_learned_from_measurements_that_were_smoothed_before():
+    true, seen = controlled()
+    smoothed = with_states(seen, true.states)
+    fitted = model(true, policy="clone", policy_sees="measurements").fit(smoothed)
+    assert fitted.policy_.estimator.exact_.all()
+
+
 def test_logged_actions_are_what_they_are():
     true, seen = controlled()
     fitted = model(true, policy=limited, policy_sees="measurements").fit(seen)
@@ -154,5 +163,17 @@ def test_set_after_a_fit_without_noise_it_is_refused():
     fitted = OneStepRegressor(LinearRegression(), policy=limited).fit(seen)
     with pytest.raises(ValueError, match='set denoise="em"'):
         fitted.set_params(policy_sees="measurements").predict(true)
-    with pytest.raises(NotFittedError, match="fit"):
+    with pytest.raises(NotFittedError, match='fit again with denoise="em"'):
         fitted.set_params(denoise="em").predict(true)
+
+
+def test_set_after_a_fit_with_latent_velocities_it_is_refused():
+    ds, _ = oscillators(8, noise=0.02)
+    fitted = OneStepRegressor(
+        LinearRegression(), latent_velocities=True, policy=lambda s, p, t: -s[:, :1]
+    ).fit(ds)
+    fitted.set_params(latent_velocities=False, denoise="em", policy_sees="measurements")
+    with pytest.raises(ValueError, match="which velocities the controller acted on"):
+        fitted.predict(ds)
+    # another fit looks for velocities no more
+    assert fitted.fit(ds).predict(ds).mean.shape == (8, 60, 1)

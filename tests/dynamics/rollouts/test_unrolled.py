@@ -300,6 +300,22 @@ def test_denoised_models_are_rolled_out_from_smoothed_states(monkeypatch):
     np.testing.assert_allclose(trained_on[0].states, fitted.smooth(ds).states)
 
 
+@pytest.mark.parametrize("value", [0.0, 0.1, 1e6 / 3])
+def test_a_state_that_never_changes_has_no_say(value):
+    ds = linear(6, shortest=10, longest=12)
+    still = TrajectoryDataset.from_arrays(
+        [np.column_stack([e.states, np.full(e.length + 1, value)]) for e in ds],
+        actions=[e.actions for e in ds],
+    )
+    weight = trainer(model().fit(still), still)._weight.numpy()
+    np.testing.assert_allclose(weight, [*(1 / ds.states.std(axis=0) ** 2), 0.0])
+
+
+def test_episodes_of_one_step_are_taken():
+    ds = linear(20, shortest=1, longest=1)
+    assert np.isfinite(model(4).fit(ds).predict(ds).mean).all()
+
+
 def test_a_baseline_is_taken_off_states_and_given_back_to_the_policy():
     ds = linear(8, shortest=10, longest=10)
     fitted = model(baseline="mean", inputs=("action", "params", "references"), policy=gain_policy)

@@ -1,8 +1,11 @@
 """What a selection tells of its members and of the data."""
 
+import re
+
 import numpy as np
 import pytest
 from sklearn.ensemble import RandomForestRegressor
+from sklearn.frozen import FrozenEstimator
 
 from tests.dynamics.crossing import Off, decays
 from tests.dynamics.systems import gain_policy, linear
@@ -13,9 +16,12 @@ from trajlearn import (
     TrajectoryRegressor,
 )
 from trajlearn.dynamics import selector as module
+from trajlearn.dynamics._selection import diagnosis
 from trajlearn.dynamics._selection.default_members import default_members
 from trajlearn.dynamics.selector import HorizonSelector
 from trajlearn.regressors import polynomial
+
+STARTS = SubtrajectoryRelabeler(starts="first", max_rows=1000)
 
 
 def selector(*members, **settings):
@@ -113,9 +119,7 @@ def oscillations(names):
 
 
 def test_members_that_see_more_than_a_state_point_to_partial_ones():
-    direct = TrajectoryRegressor(
-        RandomForestRegressor(20), relabeler=SubtrajectoryRelabeler(starts="first", max_rows=1000)
-    )
+    direct = TrajectoryRegressor(RandomForestRegressor(20), relabeler=STARTS)
     model = selector(OneStepRegressor(polynomial(1)), direct, policy=lambda s, p, t: -s[:, :1])
     whole = sentence(model.fit(oscillations(["x", "v"])), "Partial states:")
     assert "no sign. m0, which sees one state at a time" in whole
@@ -123,6 +127,18 @@ def test_members_that_see_more_than_a_state_point_to_partial_ones():
     assert "perhaps" in partial
     assert "m0 has" in partial
     assert "partial=True" in partial
+
+
+def test_of_two_members_it_is_told_whether_the_other_is_behind_or_ahead():
+    members = Off(0.1, 0.1), Off(0.2, 0.2, by_param=True), Off(0.1, 0.1), Off(0.3, 0.3)
+    evidence = selector(*members).fit(decays(noise=0.0))._evidence()
+    near, far, equal, surely = (
+        diagnosis._compared(evidence, *pair) for pair in ((0, 1), (1, 0), (0, 2), (0, 3))
+    )
+    assert re.fullmatch(r"m1 has .* the error of m0 \(its loss is less by \d.*\)\.", near)
+    assert re.fullmatch(r"m0 has .* the error of m1 \(its loss is greater by \d.*\)\.", far)
+    assert equal == "m2 has 1 times the error of m0 (its loss is the same)."
+    assert surely.startswith("m3 has 9 times the error of m0 (its loss is greater")
 
 
 def test_without_both_kinds_nothing_is_said_of_partial_states():
@@ -141,8 +157,23 @@ def test_reach_is_how_far_the_median_is_off_by_less_than_a_tenth():
 def test_divergence_is_counted():
     assert "none" in sentence(selector(Off()).fit(decays()), "Divergence:")
     model = selector(Off(0.5, 0.5), Off(diverges=0.5)).fit(decays())
-    assert "of 24 held-out forecasts" in sentence(model, "Divergence:")
-    assert "m1 12" in sentence(model, "Divergence:")
+    assert "diverged: m1 12 of 24" in sentence(model, "Divergence:")
+
+
+def test_divergence_is_counted_among_what_a_member_was_judged_by():
+    model = selector(Off(0.1, 0.1), Off(0.5, 0.5, diverges=-1.0), race=True).fit(decays())
+    assert model.report(by="member").loc["m1", "n_episodes"] == 6
+    assert "m1 6 of 6" in sentence(model, "Divergence:")
+
+
+def test_frozen_members_are_looked_into():
+    ds = linear(20, seed=1, shortest=30, longest=30).add_noise(0.1, of="std", random_state=0)
+    em = OneStepRegressor(polynomial(1), denoise="em", policy=gain_policy).fit(ds)
+    raw = OneStepRegressor(polynomial(1), policy=gain_policy).fit(ds)
+    direct = TrajectoryRegressor(RandomForestRegressor(3), relabeler=STARTS)
+    model = selector(FrozenEstimator(em), FrozenEstimator(raw), direct).fit(ds)
+    assert "m0 found measurement noise" in sentence(model, "Noise:")
+    assert "one state at a time" in sentence(model, "Partial states:")
 
 
 # -- default members ----------------------------------------------------------------------

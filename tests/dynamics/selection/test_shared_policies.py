@@ -122,10 +122,26 @@ def test_only_what_the_race_needs_is_learned(learned):
     assert shared.of("none") == {}
 
 
-def test_its_cost_is_that_of_each_member():
-    ds = linear(8)
-    slow = fitted(ds, one_step(1), one_step(2)).fit_seconds_
-    assert all(seconds > 0 for seconds in slow.values())
+def test_its_cost_is_that_of_each_member(monkeypatch):
+    learned = shared_policies._learned
+    monkeypatch.setattr(shared_policies, "_learned", lambda *given: (learned(*given)[0], 1000.0))
+    members = one_step(1), one_step(2), TrajectoryRegressor(LinearRegression())
+    slow = fitted(linear(8), *members).fit_seconds_
+    # two folds and all episodes; who shares none does not pay
+    assert slow["m0"] > 3000
+    assert slow["m1"] > 3000
+    assert slow["m2"] < 1000
+
+
+def test_an_error_says_that_it_is_the_shared_policy():
+    class Fails(LinearRegression):
+        def fit(self, X, y, sample_weight=None):
+            raise ValueError("no")
+
+    members = [one_step(k, policy_estimator=Fails()) for k in (1, 2)]
+    with pytest.raises(ValueError, match="no") as caught:
+        fitted(linear(8), *members)
+    assert "policy that members of a HorizonSelector share" in caught.value.__notes__[0]
 
 
 def test_the_number_of_workers_changes_nothing():

@@ -23,7 +23,7 @@ from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES, Prediction, Reques
 from trajlearn.dynamics._learner import Moments
 from trajlearn.dynamics._query import Query
 from trajlearn.dynamics._relative import curve, relative_to
-from trajlearn.dynamics._rollouts.rolling import RollingEstimator
+from trajlearn.dynamics._rollouts.propagated import PropagatingEstimator
 from trajlearn.dynamics._rollouts.rollout import Limits
 from trajlearn.dynamics.baselines import CurveForecaster
 from trajlearn.dynamics.propagation._algebra import root_of
@@ -32,7 +32,7 @@ from trajlearn.regressors.mlp import MLPEnsembleRegressor
 from trajlearn.trajectories import TrajectoryDataset, TransitionRelabeler, as_dataset
 from trajlearn.trajectories._columns import Columns
 
-__all__ = ["DenoisedEstimator"]
+__all__ = ["DenoisedEstimator", "as_measured"]
 
 Floats = NDArray[np.float64]
 
@@ -40,14 +40,14 @@ Floats = NDArray[np.float64]
 _NOISE_FREE = 1e-4
 
 
-class DenoisedEstimator(RollingEstimator):
-    """Rolling estimator with ``denoise="em"``."""
+class DenoisedEstimator(PropagatingEstimator):
+    """One-step estimator with `denoise` and `latent_velocities`."""
 
     denoise: str | None
     latent_velocities: bool
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        **RollingEstimator._parameter_constraints,
+        **PropagatingEstimator._parameter_constraints,
         "denoise": [StrOptions({"em"}), None],
         "latent_velocities": ["boolean"],
     }
@@ -193,15 +193,6 @@ class DenoisedEstimator(RollingEstimator):
     def _asked(self) -> str:
         return "latent_velocities=True" if self.latent_velocities else f"denoise={self.denoise!r}"
 
-    def _fit_policy(
-        self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
-    ) -> None:
-        if self.latent_velocities:
-            ds = self.smooth(ds)
-        elif ds.hindsight and getattr(self, "policy_sees", "states") == "measurements":
-            ds = _as_measured(ds)
-        super()._fit_policy(ds, weight, groups)
-
     # -- smoothing ------------------------------------------------------------------------
 
     def smooth(self, X: Any) -> TrajectoryDataset:
@@ -304,6 +295,9 @@ class DenoisedEstimator(RollingEstimator):
         moments = super()._moments(means_only=means_only)
         return moments if means_only else self._with_process_noise(moments)
 
+    def _own_moments(self) -> Moments:
+        return self._with_process_noise(super()._own_moments())
+
     def _with_process_noise(self, moments: Moments) -> Moments:
         """Variances no less than the process noise: smoothed states show the learner too little."""
         noise = getattr(self, "noise_", None)
@@ -318,9 +312,9 @@ class DenoisedEstimator(RollingEstimator):
         return with_noise
 
 
-def _as_measured(ds: TrajectoryDataset) -> TrajectoryDataset:
-    """Smoothed episodes with the states that were measured."""
-    if ds.observed is None or ds.observed_names != ds.state_names:
+def as_measured(ds: TrajectoryDataset) -> TrajectoryDataset:
+    """Episodes with the states that were measured, where they are smoothed."""
+    if not ds.hindsight or ds.observed is None or ds.observed_names != ds.state_names:
         return ds
     columns = Columns(**(vars(ds._columns) | {"states": ds.observed, "hindsight": False}))
     return TrajectoryDataset._of(columns, ds._names)

@@ -94,6 +94,13 @@ class Smoother:
         With the states of the step, the m measured ones first.
     n_measured : int
         m.
+
+    Attributes
+    ----------
+    episode : ndarray of shape (n_steps,)
+        Episode of each step.
+    still : ndarray of bool of shape (d,)
+        States that never changed in training.
     """
 
     def __init__(self, model: Any, ds: TrajectoryDataset, n_measured: int) -> None:
@@ -104,6 +111,7 @@ class Smoother:
         self._begin = np.flatnonzero(begin)
         self.episode = np.searchsorted(ds.offsets, self._begin, side="right") - 1
         self._rows = model.relabeler_.rows(ds, self.episode, self._begin, self._begin + 1)
+        self.still = np.ptp(model.rolled_range_, axis=0) == 0
 
     def step(self, states: Floats) -> tuple[Floats, Floats]:
         """What follows each state but the last of an episode, and its slopes."""
@@ -158,8 +166,7 @@ class Smoother:
             of = np.searchsorted(self.ds.offsets, pieces.rows[0, pieces.first])
             covariance[of] = posterior.covariance[0, pieces.first]
         # what never changes has no noise, and a learner would blow up what round-off adds
-        still = np.ptp(self.model.rolled_range_, axis=0) == 0
-        found[:, still] = states[:, still]
+        found[:, self.still] = states[:, self.still]
         return found, covariance
 
     def smoothed(self, states: Floats, noise: NoiseModel) -> Floats:
@@ -229,7 +236,8 @@ def first_noise(
     m = smoother.n_measured
     after, slopes = smoother.step(states)
     shown = residual_noise(states[smoother.ends] - after, slopes, smoother.episode)
-    variance = states.var(axis=0)
+    # of a constant such as 0.1 it would be round-off
+    variance = np.where(smoother.still, 0.0, states.var(axis=0))
     least = _SURELY_NONE * np.where(variance > 0, variance, 1.0)
     unit = np.maximum(shown.residual / 2, least)
     if measurement is None:

@@ -1,4 +1,4 @@
-"""What models of one step share: the inputs of a roll-out and where its actions come from."""
+"""What models of one step share: fitting, where actions come from, and forecasts by roll-outs."""
 
 from abc import abstractmethod
 from collections.abc import Sequence
@@ -14,17 +14,10 @@ from trajlearn.dynamics._dynamics import DynamicsEstimator
 from trajlearn.dynamics._forecaster import DIVERGENCE_RANGES, Prediction, Request
 from trajlearn.dynamics._learner import seeded, spread
 from trajlearn.dynamics._query import Query
-from trajlearn.dynamics._rollouts.cloned_policy import ClonedPolicy, clone_policy, controller
-from trajlearn.dynamics._rollouts.noisy_sight import Normal, independent, noisy_sight, paired
-from trajlearn.dynamics._rollouts.rollout import (
-    InputRows,
-    Limits,
-    Step,
-    checked_actions,
-    filled,
-    roll_out,
-)
-from trajlearn.dynamics._rollouts.window import Window
+from trajlearn.dynamics._rollouts.cloned_policy import ClonedPolicy, clone_policy
+from trajlearn.dynamics._rollouts.input_rows import input_rows
+from trajlearn.dynamics._rollouts.noisy_sight import independent, paired
+from trajlearn.dynamics._rollouts.rollout import InputRows, Limits, Step, roll_out
 from trajlearn.dynamics.baselines import ReferenceForecaster
 from trajlearn.exceptions import MissingFieldError, MixedSamplingError
 from trajlearn.regressors.control_law import ControlLawRegressor
@@ -35,7 +28,6 @@ from trajlearn.trajectories.times import uniform_step
 __all__ = ["RollingEstimator"]
 
 Floats = NDArray[np.float64]
-
 
 # of the particles behind a mean
 _SIGHT_SEED = 0
@@ -144,9 +136,8 @@ class RollingEstimator(DynamicsEstimator):
     def _fit_episodes(
         self, ds: TrajectoryDataset, weight: Floats | None, groups: NDArray[Any] | None
     ) -> None:
+        self.__dict__.pop("policy_", None)
         super()._fit_episodes(ds, weight, groups)
-        if hasattr(self, "policy_"):
-            del self.policy_
         if self._clones() and "action" in self.layout_:
             self._fit_policy(ds, weight, groups)
 
@@ -188,6 +179,7 @@ class RollingEstimator(DynamicsEstimator):
                 "policy='clone' needs episodes: rows do not say which of their columns the "
                 "controller saw. Fit on episodes, or give a policy= that is known."
             )
+        self.__dict__.pop("policy_", None)
         super()._fit_door_of_rows(X, y, sample_weight, groups)
 
     # -- roll-outs ------------------------------------------------------------------------
@@ -256,11 +248,11 @@ class RollingEstimator(DynamicsEstimator):
         self._check_time_step(query.ds)
         std = self._unseen_by(source)
         sight = None if std is None else (std, independent(request.rng))
-        inputs = self._input_rows(query, source, policy, sight)
+        inputs = input_rows(self, query, source, policy, sight)
         prediction = self._rolled_out(query, request, inputs)
         if std is not None:
             sight = std, paired(len(query), _SIGHT_SEED)
-            inputs = self._input_rows(query, source, policy, sight)
+            inputs = input_rows(self, query, source, policy, sight)
             prediction.mean = self._mean_of_particles(query, inputs)
         prediction.actions = source
         return prediction
@@ -308,109 +300,6 @@ class RollingEstimator(DynamicsEstimator):
             clip = (centre - self.clip_states * width / 2, centre + self.clip_states * width / 2)
         width = np.ptp(self.state_range_, axis=0)
         return Limits(clip, centre, DIVERGENCE_RANGES * np.where(width > 0, width, 1.0))
-
-    def _input_rows(
-        self,
-        query: Query,
-        source: str,
-        policy: Any,
-        sight: tuple[Floats, Normal] | None = None,
-    ) -> InputRows:
-        """Rows of inputs at each step of a roll-out; only known signals and actions enter.
-
-        For any number of copies of the starts: copy i of start j is row ``i * len(query) + j``.
-        `sight` is the noise of what a policy sees, its standard deviation and how it is drawn.
-        """
-        ds = query.ds
-        blocks: dict[str, Floats] = {}
-        if "params" in self.layout_ or source == "policy":
-            theta = self._theta(query)
-        if "context" in self.layout_:
-            blocks["context"] = self.relabeler_.context_rows(ds)
-        if "references" in self.layout_:
-            ds.require("references", by=f"{type(self).__name__} (fitted with references)")
-            assert ds.references is not None
-            references = query.future(ds.references, steps=False)
-        logged = None
-        if source == "logged":
-            assert ds.actions is not None  # _source has checked
-            logged = query.future(ds.actions, steps=True)
-        times = np.concatenate([query.initial_times[:, None], query.times], axis=1)
-        times = filled(times)
-        if source == "policy":
-            n_told = ds.states.shape[1] if query.base is not None and self._told() else 0
-            control = controller(policy, query, theta, times, n_told)
-            if sight is not None:
-                control = noisy_sight(control, *sight)
-        window = self._window()
-        if window is not None:
-            at_start = window.before(query)
-
-        def inputs(states: Floats, k: int, previous: Floats | None) -> tuple[Floats, Floats | None]:
-            copies = len(states) // len(query)
-            now: dict[str, Floats] = {"state": states}
-            past: dict[str, Floats] = {}
-            if window is not None:
-                # what a roll-out carries along is the window, not the last action
-                behind = np.tile(at_start, (copies, 1)) if previous is None else previous
-                past = window.blocks(behind, states)
-                now |= past
-            if logged is not None:
-                blocks["action"] = logged[:, k]
-            elif source == "policy":
-                # the controller knows the state itself, not what it is relative to
-                base = 0.0 if query.base is None else np.tile(query.base[:, k], (copies, 1))
-                actions = control(states + base, k, past)
-                now["action"] = checked_actions(actions, self.layout_["action"], states)
-            if "params" in self.layout_:
-                blocks["params"] = theta[:, k]
-            if "dt" in self.layout_:
-                blocks["dt"] = (times[:, k + 1] - times[:, k])[:, None]
-            if "references" in self.layout_:
-                blocks["references"] = np.concatenate(
-                    [references[:, k], references[:, k + 1]], axis=1
-                )
-            for block, values in blocks.items():
-                now[block] = values if copies == 1 else np.tile(values, (copies, 1))
-            if "previous" in self.layout_:
-                before = self._before(query, now["action"]) if previous is None else previous
-                now["previous"] = before
-            carried = now.get("action")
-            if window is not None:
-                carried = window.after(behind, states, carried)
-            return self.layout_.assemble(now), carried
-
-        return inputs
-
-    def _window(self) -> Window | None:
-        """The window that a roll-out carries, if a row shows more than one state."""
-        if self._history() == 1:
-            return None
-        columns = self.layout_.columns
-        return Window(self._history(), len(columns["state"]), len(columns.get("action", ())))
-
-    def _before(self, query: Query, actions: Floats) -> Floats:
-        """Action before the start of each row; the first of an episode has none but itself."""
-        ds, started = query.ds, query.start > 0
-        if not started.any():
-            return actions
-        if ds.actions is None:
-            raise MissingFieldError(
-                f"{type(self).__name__} was fitted with the previous action, but the episodes have "
-                "no actions before the start. Give them, or forecast from the first state."
-            )
-        copies = len(actions) // len(query)
-        step = query.rows - np.arange(len(query)) - started
-        return np.where(
-            np.tile(started, copies)[:, None], np.tile(ds.actions[step], (copies, 1)), actions
-        )
-
-    def _theta(self, query: Query) -> Floats:
-        """theta_t along the roll-out (n, H, p)."""
-        params = query.ds.step_params if query.ds.params_vary else None
-        if params is None:
-            return np.repeat(query.params()[:, None], query.n_steps, axis=1)
-        return query.future(params, steps=True)
 
     def _time_grid(self, horizons: Floats) -> tuple[Floats, NDArray[np.intp]]:
         if "dt" in self.layout_:

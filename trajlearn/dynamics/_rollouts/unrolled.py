@@ -149,7 +149,7 @@ class _Starts:
         self._cumulative = np.cumsum(share)
 
     def draw(self, n_members: int, n: int, n_steps: int) -> Stretches:
-        """N roll-outs for each member."""
+        """Roll-outs of `n_steps` from `n` starts for each member."""
         u = self._rng.random((n_members, n)) * self._cumulative[-1]
         chosen = np.searchsorted(self._cumulative, u, side="right")
         return Stretches.of(self.ds, self._begin[chosen], n_steps)
@@ -177,7 +177,9 @@ class _Trainer:
         self._unit = tensor(learner.target_scale_ * model.target_scale_)
         self._offset = tensor(learner.target_mean_ * model.target_scale_)
         spread = ds.states.std(axis=0)
-        self._weight = tensor(1 / np.where(spread > 0, spread, np.inf) ** 2)
+        # round-off alone is no spread
+        least = 1e-12 * unrolled.magnitude
+        self._weight = tensor(1 / np.where(spread > least, spread, np.inf) ** 2)
         self._activation = _ACTIVATIONS[learner.activation]
 
     def train(self, starts: _Starts, *, verbose: int) -> None:

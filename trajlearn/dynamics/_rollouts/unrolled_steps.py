@@ -91,6 +91,12 @@ class Unrolled:
         clip = model._limits().clip
         self._clip = None if clip is None else [self._tensor(bound) for bound in clip]
 
+    @property
+    def magnitude(self) -> Floats:
+        """Greatest size of each logged state (d_s,)."""
+        largest: Floats = np.abs(self._logged.states).max(axis=0)
+        return largest
+
     def targets(self, stretches: Stretches) -> Tensor:
         """Logged states after each step (L, E, m, d_s)."""
         return self._by_member(self._ds.states[stretches.state + 1], stretches)

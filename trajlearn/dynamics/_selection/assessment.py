@@ -1,17 +1,15 @@
 """What each of several forecasters shows on episodes that it was not fitted on."""
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
-from numbers import Integral
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.model_selection import GroupKFold, check_cv
 from tqdm import tqdm
 
-from trajlearn.dynamics._selection.entrant import Assessment, Entrant, Fold, Ints, judged
+from trajlearn.dynamics._selection.entrant import Assessment, Entrant, judged
+from trajlearn.dynamics._selection.folds import Fold, units_of
 from trajlearn.dynamics._selection.losses import horizon_losses
 from trajlearn.dynamics._selection.race import enough_to_race, in_the_race
 from trajlearn.dynamics._selection.shared_policies import SharedPolicies
@@ -19,53 +17,10 @@ from trajlearn.dynamics._shared_states import shared_states
 from trajlearn.regressors._threads import by_workers
 from trajlearn.trajectories import TrajectoryDataset
 
-__all__ = ["assess_all", "errors_in_ranges", "held_out_folds", "states_of", "units_of"]
+__all__ = ["assess_all", "errors_in_ranges", "states_of"]
 
 Floats = NDArray[np.float64]
-# so few episodes (groups) are left out one by one
-_FEW = 5
-
-
-def units_of(ds: TrajectoryDataset) -> Ints:
-    """The group of each episode, counted from 0; without groups each is its own."""
-    labels = np.arange(len(ds)) if ds.group is None else ds.group
-    return np.unique(labels, return_inverse=True)[1].astype(np.intp)
-
-
-def held_out_folds(ds: TrajectoryDataset, cv: Any, rng: np.random.Generator) -> list[Fold]:
-    """Episodes to fit on and episodes to judge by, each at most once.
-
-    Raises
-    ------
-    ValueError
-        If there is one episode (group) only, or one is held out twice.
-    """
-    units, seed = units_of(ds), int(rng.integers(2**31))
-    n_units = int(units.max()) + 1
-    if n_units < 2:
-        what = "episode" if ds.group is None else "group"
-        raise ValueError(
-            f"members are judged by {what}s that they were not fitted on, and there is only one "
-            f"{what}: give more, or fit the member of your choice by itself. A "
-            f"CalibratedForecaster around a selector holds out {what}s of its own first: give it "
-            "three or more, or calibrate a fitted selector, "
-            "CalibratedForecaster(FrozenEstimator(selector)), on others."
-        )
-    splitter = cv
-    if isinstance(cv, Integral):
-        n_folds = n_units if n_units <= _FEW else min(int(cv), n_units)
-        splitter = GroupKFold(n_folds, shuffle=True, random_state=seed)
-    with warnings.catch_warnings():
-        # a splitter that has no use for groups was chosen knowingly
-        warnings.filterwarnings("ignore", "The groups parameter is ignored", UserWarning)
-        folds = list(check_cv(splitter).split(ds, groups=units))
-    tested = np.concatenate([test for _, test in folds])
-    if len(np.unique(tested)) < len(tested):
-        raise ValueError(
-            f"cv = {cv!r} holds out an episode twice, but each is to count once: take a splitter "
-            "such as KFold or GroupKFold."
-        )
-    return folds
+Ints = NDArray[np.intp]
 
 
 def assess_all(

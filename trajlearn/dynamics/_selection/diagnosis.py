@@ -3,8 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from trajlearn.dynamics._members import unwrapped
 from trajlearn.dynamics._rollouts.rolling import RollingEstimator
-from trajlearn.dynamics._selection.report import Evidence, last_step, measurement_noise
+from trajlearn.dynamics._selection.report import Evidence, measurement_noise
 from trajlearn.dynamics.trajectory import TrajectoryRegressor
 
 __all__ = ["diagnosis"]
@@ -75,12 +76,12 @@ def _partial(evidence: Evidence) -> str:
 
 
 def _divergence(evidence: Evidence) -> str:
-    n = evidence.errors.shape[1]
     gone = np.isinf(evidence.errors).any(axis=2).sum(axis=1)
     if not gone.any():
         return "Divergence: none of the held-out forecasts diverged."
-    told = ", ".join(f"{evidence.names[i]} {gone[i]}" for i in np.flatnonzero(gone))
-    return f"Divergence: of {n} held-out forecasts, so many diverged: {told}."
+    judged = evidence.n_judged
+    told = ", ".join(f"{evidence.names[i]} {gone[i]} of {judged[i]}" for i in np.flatnonzero(gone))
+    return f"Divergence: of the held-out forecasts, so many diverged: {told}."
 
 
 def _reach(evidence: Evidence) -> str:
@@ -101,7 +102,7 @@ def _reach(evidence: Evidence) -> str:
 
 def _sees(evidence: Evidence, i: int) -> str:
     """What a member sees of the past: the "state", "more", or it is not known."""
-    model = last_step(evidence.models[i])
+    model = unwrapped(evidence.models[i])
     if isinstance(model, TrajectoryRegressor):
         # it need not go through the states between
         return "more"
@@ -119,14 +120,17 @@ def _ratio(evidence: Evidence, one: int, other: int) -> float:
     return errors[0] / errors[1]
 
 
-def _compared(evidence: Evidence, better: int, worse: int) -> str:
+def _compared(evidence: Evidence, one: int, other: int) -> str:
+    """How far the other member is behind, or ahead, and how surely."""
     every = slice(0, len(evidence.losses.knots))
-    gain, unsure = evidence.losses.over(every, better, worse)
-    names = evidence.names
-    sure = f"{gain / unsure:.1f} standard errors" if unsure > 0 else "no difference at all"
+    gain, unsure = evidence.losses.over(every, one, other)
+    apart = "is the same"
+    if gain:
+        sure = f"by {abs(gain) / unsure:.1f} standard errors" if unsure > 0 else "in every episode"
+        apart = f"is {'greater' if gain > 0 else 'less'} {sure}"
     return (
-        f"{names[worse]} has {_ratio(evidence, worse, better):.2g} times the error of "
-        f"{names[better]} (losses {sure} apart)."
+        f"{evidence.names[other]} has {_ratio(evidence, other, one):.3g} times the error of "
+        f"{evidence.names[one]} (its loss {apart})."
     )
 
 

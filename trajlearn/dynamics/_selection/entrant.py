@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.frozen import FrozenEstimator
 
+from trajlearn.dynamics._selection.folds import Fold
 from trajlearn.dynamics._selection.joint_folds import FoldFits
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.exceptions import DivergenceWarning, HorizonWarning
@@ -19,7 +20,6 @@ __all__ = ["Assessment", "Entrant", "judged"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
-Fold = tuple[Ints, Ints]
 
 
 @dataclass(frozen=True, eq=False)

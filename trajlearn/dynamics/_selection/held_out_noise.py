@@ -52,7 +52,8 @@ def noise_of(
     assessment : Assessment
     state_range : ndarray of shape (2, d_s)
     columns : ndarray of shape (k,)
-        States that are logged. Of the others nothing is known: they get their range.
+        States that are logged. Of the others nothing is known, nor of any about steps at which
+        all forecasts have diverged: there, the spread is the training range.
     bandwidth : float
     """
     errors = np.full((*assessment.elapsed.shape, state_range.shape[1]), np.nan)
@@ -61,11 +62,12 @@ def noise_of(
     power = np.where(usable, errors, 0.0) ** 2
     knots = knots_of(errors.shape[1])
     kernel = kernel_of(errors.shape[1], knots, bandwidth)
-    # (H, d_s) about each knot
-    mean = (kernel @ power.sum(axis=0)) / np.maximum(kernel @ usable.sum(axis=0), 1e-300)
+    # (K, d_s) about each knot
+    count = kernel @ usable.sum(axis=0)
+    total = kernel @ power.sum(axis=0)
+    unknown = np.broadcast_to(np.ptp(state_range, axis=0) ** 2, total.shape)
+    mean = np.divide(total, count, out=unknown.copy(), where=count > 0)
     steps = np.log(np.arange(1, errors.shape[1] + 1))
     spread = np.stack([np.interp(steps, np.log(knots), np.sqrt(m)) for m in mean.T], axis=1)
-    unlogged = np.setdiff1d(np.arange(spread.shape[1]), columns)
-    spread[:, unlogged] = np.ptp(state_range[:, unlogged], axis=0)
     residuals = Residuals(errors, np.ones_like(errors), assessment.elapsed)
     return HeldOutNoise(spread, residual_paths(residuals))

@@ -6,14 +6,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trajlearn.dynamics._members import unwrapped
 from trajlearn.dynamics._selection.losses import HorizonLosses
 
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Evidence", "by_horizon", "by_member", "errors_by_horizon", "last_step"]
+__all__ = ["Evidence", "by_horizon", "by_member", "errors_by_horizon", "measurement_noise"]
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,11 @@ class Evidence:
     state_range: Floats
     fit_seconds: dict[str, float]
     predict_seconds: dict[str, float]
+
+    @property
+    def n_judged(self) -> Ints:
+        """Episodes that each member was judged by (M,)."""
+        return (~np.isnan(self.errors).all(axis=2)).sum(axis=1)
 
     @property
     def blocks(self) -> list[tuple[int, int, int]]:
@@ -140,7 +147,6 @@ def by_member(evidence: Evidence) -> "pd.DataFrame":
     averages = evidence.losses.averages
     steps = evidence.losses.width * ~np.isnan(averages)
     loss = (np.nan_to_num(averages) * steps).sum(axis=1) / steps.sum(axis=1)
-    judged = (~np.isnan(evidence.errors).all(axis=2)).sum(axis=1)
     rows = []
     for i in evidence.ranking(1, n_steps):
         name, noise = evidence.names[i], measurement_noise(evidence.models[i])
@@ -148,7 +154,7 @@ def by_member(evidence: Evidence) -> "pd.DataFrame":
             {
                 "member": name,
                 "steps": int((winner == i).sum()),
-                "n_episodes": int(judged[i]),
+                "n_episodes": int(evidence.n_judged[i]),
                 "error": evidence.error(i, 1, n_steps),
                 "loss": loss[i],
                 "n_diverged": int(np.isinf(evidence.errors[i]).any(axis=1).sum()),
@@ -160,14 +166,9 @@ def by_member(evidence: Evidence) -> "pd.DataFrame":
     return pd.DataFrame(rows).set_index("member")
 
 
-def last_step(model: Any) -> Any:
-    """The estimator that forecasts: the last step of a Pipeline."""
-    return model.steps[-1][1] if hasattr(model, "steps") else model
-
-
 def measurement_noise(model: Any) -> Floats | None:
     """Standard deviation by state that a denoised model found; None of those that do not look."""
-    model = last_step(model)
+    model = unwrapped(model)
     if getattr(model, "denoise", None) is None or not hasattr(model, "noisy_"):
         return None
     found = np.asarray(model.measurement_noise_, dtype=np.float64)

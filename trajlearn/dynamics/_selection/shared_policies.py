@@ -68,8 +68,9 @@ class SharedPolicies:
             for kind, k in wanted
             for _, _, history, timed in [kind]
         ]
-        for (kind, k), found in zip(wanted, by_workers(_learned, jobs, self._n_jobs)):
-            self._found[kind][k], seconds = found
+        found = by_workers(_learned, jobs, self._n_jobs)
+        for (kind, k), (policy, seconds) in zip(wanted, found):
+            self._found[kind][k] = policy
             self._seconds[kind] += seconds
 
     def of(self, name: str) -> Mapping[int, ClonedPolicy]:
@@ -109,5 +110,9 @@ def _learned(
     """Policy that a model of a step learns from episodes, and how long it took."""
     began = time.perf_counter()
     groups = np.arange(len(ds)) if ds.group is None else ds.group
-    policy = clone_policy(ds, learner, history=history, timed=timed, groups=groups)
+    try:
+        policy = clone_policy(ds, learner, history=history, timed=timed, groups=groups)
+    except Exception as error:
+        error.add_note("This happened to a policy that members of a HorizonSelector share.")
+        raise
     return policy, time.perf_counter() - began
