@@ -9,6 +9,7 @@ from benchmarks._results import read_json
 from benchmarks.paper._command import read_tables
 from benchmarks.paper._iterative_tables import result
 from benchmarks.paper._reward_page import brief
+from benchmarks.regimes._regimes import FRESH
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -46,6 +47,15 @@ def test_the_table_of_searches_is_the_committed_one():
         name, *numbers = [cell.strip() for cell in row.strip("|").split("|")]
         median = found.by_trial(SEARCHES.get(name, name), "best_true").median()
         assert numbers == [f"{median[trial]:.3f}" for trial in (1, 2, 3, 5, 10)], name
+
+
+def test_the_map_of_regimes_is_the_committed_one():
+    folder = ROOT / "benchmarks/regimes/results/regimes"
+    facts = read_json(folder / "cartpole.json")
+    assert facts["mode"] == "full"
+    assert len(set(facts["seeds"]) & set(FRESH)) >= 3
+    assert f"({(folder / 'regimes.png').relative_to(ROOT)})" in README
+    assert (folder / "regimes.png").is_file()
 
 
 @pytest.mark.parametrize("command", ["make table", "make test"])

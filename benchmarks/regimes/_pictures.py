@@ -293,7 +293,9 @@ def apart(system: str, ratios: pd.DataFrame) -> "Figure":
         ax.set_xscale("log")
         low, high = ax.get_xlim()
         ax.set_xlim(min(low, 0.45), max(high, 5.0))
-        ax.set_xticks([0.5, 1, 2, 4], ["0.5", "1", "2", "4"])
+        shown = {0.5: "0.5", 1: "1", 2: "2", 4: "4"} if high < _DARKEST else {1: "1", 4: "4"}
+        shown |= {10.0**k: f"1e{k}" for k in range(2, 12, 2) if 10.0**k < high}
+        ax.set_xticks(list(shown), list(shown.values()))
         ax.minorticks_off()
         ax.set_title(f"{statistic} over episodes", loc="left", fontsize=10)
         ax.set_xlabel("error of the selector / of the best single model")
