@@ -87,7 +87,7 @@ def report(system: str, tables: Tables) -> str:
         lines += ["### Costs, and the noise that was found", "", markdown(costs(fits)), ""]
         lines += [
             "CPU seconds of five fits (four folds and all episodes; with five episodes, six), "
-            "median over regimes and seeds. Noise: share of the fits on noisy and on noise-free "
+            "median over regimes and seeds. Noise: share of the fits on noisy, noise-free and real "
             "states in which measurement noise was found, and its estimate over the truth.",
             "",
         ]
@@ -182,10 +182,10 @@ def costs(fits: pd.DataFrame) -> pd.DataFrame:
     for member, some in fits.groupby("member", sort=False):
         line = {"member": member, "seconds": some["seconds"].median()}
         if "found" in some and some["found"].notna().any():
-            noisy = some["std/true"].notna()
-            found = some["found"].astype(float)
+            noisy, found = some["true"] > 0, some["found"].astype(float)
             line["found, noisy"] = found[noisy].mean()
-            line["found, noise-free"] = found[~noisy].mean()
+            line["found, noise-free"] = found[some["true"] == 0].mean()
+            line["found, unknown"] = found[some["true"].isna()].mean()
             hit = some.loc[noisy & (found > 0), "std/true"]
             line["estimate / true"] = (
                 f"{hit.median():.2f} ({hit.min():.2f} to {hit.max():.2f})" if len(hit) else ""

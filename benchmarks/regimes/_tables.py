@@ -175,6 +175,8 @@ def _fits(ours: Found) -> pd.DataFrame:
             if noise is not None:
                 std, true = np.array(noise["std"]), np.array(noise["true"])
                 line |= {"found": noise["found"], "std": float(np.sqrt((std**2).mean()))}
+                # 0 where states are exact, NaN where nobody knows
+                line["true"] = float(np.sqrt((true**2).mean()))
                 line["std/true"] = float(np.median(std / true)) if (true > 0).all() else np.nan
             lines.append(line)
     return pd.DataFrame(lines)
