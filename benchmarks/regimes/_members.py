@@ -20,7 +20,7 @@ from trajlearn import (
     TrajectoryDataset,
     default_members,
 )
-from trajlearn.dynamics._selection.joint_folds import fit_folds
+from trajlearn.dynamics._selection.joint_folds import FoldFits
 from trajlearn.regressors import polynomial
 from trajlearn.regressors.control_law import ControlLawRegressor
 
@@ -162,7 +162,9 @@ def cell(system: str, regime: str, mode: str, seed: int) -> dict[str, Any]:
     for name, member in members_of(what, data.train, data.policy, mode):
         began = time.process_time()
         with expected_warnings():
-            fitted[name] = fit_folds(member, data.train, folds, rng=rng)
+            fits = FoldFits(member, data.train, folds, rng=rng)
+            models = fits.fit(range(len(folds)), whole=True)
+        fitted[name] = models, fits.model
         seconds[name] = time.process_time() - began
         model = fitted[name][1]
         if getattr(model, "denoise", None) is not None:

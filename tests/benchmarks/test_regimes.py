@@ -17,6 +17,7 @@ from benchmarks.regimes._scores import BLOCK_ENDS, block_of, errors_of, scores, 
 from benchmarks.regimes._tables import EXACT, ratios
 from benchmarks.regimes.regimes import BENCHMARK, MBRL, SEEDS, cells
 from trajlearn import Cartpole, OneStepRegressor
+from trajlearn.dynamics._selection.joint_folds import FoldFits
 from trajlearn.dynamics.selector import HorizonSelector
 from trajlearn.regressors import polynomial
 from trajlearn.regressors.control_law import ControlLawRegressor
@@ -161,8 +162,10 @@ def test_one_fit_serves_a_known_and_a_cloned_policy_and_the_selector_chooses_as_
                for k in (1, 2)]  # fmt: skip
     plain = [(n, m.__sklearn_clone__().set_params(policy=data.policy)) for n, m in members]
     alone = HorizonSelector(plain, cv=folds, random_state=0).fit(data.train)
-    rng = np.random.default_rng(0)
-    fitted = {n: _members.fit_folds(m, data.train, folds, rng=rng) for n, m in members}
+    fitted = {}
+    for name, member in members:
+        fits = FoldFits(member, data.train, folds, rng=np.random.default_rng(0))
+        fitted[name] = fits.fit(range(len(folds)), whole=True), fits.model
     found = _members.judged(fitted, folds, data, data.policy)
     assert found["best"] == alone.best_
     assert [list(line) for line in found["choice"]] == _members._stretches(alone.choice_)

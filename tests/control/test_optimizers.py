@@ -5,6 +5,7 @@ import sys
 import numpy as np
 import pytest
 
+from trajlearn.control import _optimizers
 from trajlearn.control._optimizers import METHODS, Found, checked_bounds, maximise
 
 # metres beside millinewtons
@@ -275,3 +276,16 @@ def test_without_pycma_it_says_what_to_install(monkeypatch):
     with pytest.raises(ImportError, match=r"trajlearn\[search\]"):
         search(quadratic(BEST, BOUNDS), BOUNDS, method="cma")
     search(quadratic(BEST, BOUNDS), BOUNDS, method="cem", n_evaluations=10)
+
+
+def test_each_restart_begins_somewhere_else():
+    strategy = _optimizers._CmaEs(2, 8, np.random.default_rng(0))
+    begins = []
+    while len(begins) < 4:
+        points = strategy.ask()
+        # nothing is to be gained here
+        strategy.tell(points, np.zeros(len(points)))
+        if strategy._strategy is None:
+            begins.append(strategy._begin)
+    apart = np.linalg.norm(np.subtract.outer(begins, begins).diagonal(axis1=1, axis2=3), axis=2)
+    assert (apart[~np.eye(4, dtype=bool)] > 0.05).all()

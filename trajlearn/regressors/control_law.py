@@ -12,9 +12,9 @@ from sklearn.utils import Tags, check_random_state
 from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
 
 from trajlearn._sklearn import Interval, fit_context
+from trajlearn.regressors._rows_in_folds import RowsInFolds, dealt, spread_of
 from trajlearn.regressors._saturated import (
     Floats,
-    Normal,
     Term,
     forward_errors,
     forward_order,
@@ -28,19 +28,13 @@ from trajlearn.regressors.mlp import MLPEnsembleRegressor
 
 __all__ = ["ControlLawRegressor"]
 
-Ints = NDArray[np.intp]
-
 _RIDGE = 1e-12
 # ridges of the bilinear law, shares of the mean square of a column
 _RIDGES = (1e-12, 1e-6, 1e-4, 1e-2)
 # a law that misses no training row by more, in standard deviations, is the law
 _EXACT = 1e-5
-# with fewer groups than that each is left out once, with more they are dealt to four folds
-_FEW_GROUPS, _FOLDS = 10, 4
 # rows that terms are chosen on, evenly spaced
 _FOR_CHOICE = 8000
-# rows and inputs with which they are chosen for each fold again
-_FEW_ROWS, _FEW_INPUTS = 2500, 20
 # monomials to choose from
 _MOST_CANDIDATES = 800
 # inputs of the first choice that are tried in the third degree
@@ -175,8 +169,8 @@ class ControlLawRegressor(RegressorMixin, BaseEstimator):
         self._y_ndim = targets.ndim
         rows, targets = rows[keep], np.asarray(targets, dtype=np.float64)[keep]
         targets = targets.reshape(len(rows), -1)
-        fold = _folds(np.concatenate([rows, targets], axis=1), labels)
-        data = _Data(rows, targets, weight[keep], fold)
+        fold = dealt(np.concatenate([rows, targets], axis=1), labels)
+        data = RowsInFolds(rows, targets, weight[keep], fold)
         self.limits_ = np.stack([targets.min(axis=0), targets.max(axis=0)])
         product = _bilinear(rows.shape[1], _columns(gains, rows.shape[1]))
         laws = [self._law(data, j, product) for j in range(targets.shape[1])]
@@ -187,13 +181,13 @@ class ControlLawRegressor(RegressorMixin, BaseEstimator):
         self._judge(data, laws, product)
         return self
 
-    def _law(self, data: "_Data", j: int, product: list[Term]) -> "_Law":
+    def _law(self, data: RowsInFolds, j: int, product: list[Term]) -> "_Law":
         """The bilinear law if it reproduces the target, else what predicts held-out rows best."""
         law, y = _Law(product, _RIDGE, exact=True), data.y[:, j]
         if len(product) <= min(data.weight.sum() / 2, _MOST_CANDIDATES):
             fitted = monomials(data.X, product) @ self._fitted(data, j, law)
             off = np.abs(np.clip(fitted, *self.limits_[:, j]) - y)
-            if (off <= _EXACT * _spread(y, data.weight)).all():
+            if (off <= _EXACT * spread_of(y, data.weight)).all():
                 return law
         # what a saturated output would have been is not known yet
         inside = np.flatnonzero((y > y.min()) & (y < y.max()))
@@ -201,12 +195,12 @@ class ControlLawRegressor(RegressorMixin, BaseEstimator):
             return _Law([()], _RIDGE)
         return self._chosen(data.at(inside[:: -(-len(inside) // _FOR_CHOICE)]), j, product)
 
-    def _fitted(self, data: "_Data", j: int, law: "_Law") -> Floats:
+    def _fitted(self, data: RowsInFolds, j: int, law: "_Law") -> Floats:
         low, high = self.limits_[:, j]
         Z = monomials(data.X, law.terms)
         return saturated_fit(Z, data.y[:, j], data.weight, (low, high), law.ridge)
 
-    def _chosen(self, data: "_Data", j: int, product: list[Term]) -> "_Law":
+    def _chosen(self, data: RowsInFolds, j: int, product: list[Term]) -> "_Law":
         columns = list(range(data.X.shape[1]))
         candidates = terms_of(columns, min(self.degree, 2))
         if len(candidates) > _MOST_CANDIDATES:
@@ -225,7 +219,9 @@ class ControlLawRegressor(RegressorMixin, BaseEstimator):
         best = int(np.argmin(errors))
         return _Law(product, _RIDGES[best]) if errors[best] < error else _Law(terms, _RIDGE)
 
-    def _forward(self, data: "_Data", j: int, candidates: list[Term]) -> tuple[list[Term], float]:
+    def _forward(
+        self, data: RowsInFolds, j: int, candidates: list[Term]
+    ) -> tuple[list[Term], float]:
         """Terms in the order of their choice, and the held-out sum of squares."""
         folds = data.sums(candidates, j)
         most = min(self.max_terms, len(candidates), max(int(data.weight.sum() / 10), 1))
@@ -238,9 +234,9 @@ class ControlLawRegressor(RegressorMixin, BaseEstimator):
         order = forward_order(total, max(enough, 1))
         return [candidates[i] for i in order], float(errors[enough])
 
-    def _judge(self, data: "_Data", laws: list["_Law"], product: list[Term]) -> None:
+    def _judge(self, data: RowsInFolds, laws: list["_Law"], product: list[Term]) -> None:
         """Held-out errors; a network takes over the outputs that it is better at."""
-        spread = _spread(data.y, data.weight)
+        spread = spread_of(data.y, data.weight)
         self.by_network_, self.network_ = np.zeros(len(laws), dtype=bool), None
         splits = data.splits()
 
@@ -274,7 +270,7 @@ class ControlLawRegressor(RegressorMixin, BaseEstimator):
             self.network_ = network.fit(data.X, data.y, sample_weight=data.weight)
 
     def _unseen(
-        self, own: "_Data", out: "_Data", laws: list["_Law"], product: list[Term]
+        self, own: RowsInFolds, out: RowsInFolds, laws: list["_Law"], product: list[Term]
     ) -> Floats:
         """Predictions of rows by laws that were fitted on others."""
         predicted = np.empty(out.y.shape)
@@ -318,41 +314,6 @@ class _Law:
     exact: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class _Data:
-    """Rows, targets (n, d), weights and folds."""
-
-    X: Floats
-    y: Floats
-    weight: Floats
-    fold: Ints
-
-    def at(self, rows: NDArray[Any]) -> "_Data":
-        return _Data(self.X[rows], self.y[rows], self.weight[rows], self.fold[rows])
-
-    def sums(self, terms: list[Term], j: int) -> list[Normal]:
-        """What least squares of a target needs of each fold."""
-        Z, y, weight = monomials(self.X, terms), self.y[:, j], self.weight
-        masks = (self.fold == k for k in np.unique(self.fold))
-        return [Normal.of(Z[own], y[own], weight[own]) for own in masks]
-
-    @property
-    def is_small(self) -> bool:
-        """Whether it costs little to choose terms again and again."""
-        return len(self.X) <= _FEW_ROWS and self.X.shape[1] <= _FEW_INPUTS
-
-    def splits(self) -> list[tuple["_Data", "_Data"]]:
-        """Rows to fit on, and rows to judge by: every fold once, or the last where they are many.
-
-        All rows twice where there is one fold.
-        """
-        folds = np.unique(self.fold)
-        if len(folds) == 1:
-            return [(self, self)]
-        judged = folds if self.is_small else folds[-1:]
-        return [(self.at(self.fold != k), self.at(self.fold == k)) for k in judged]
-
-
 def _labels(groups: ArrayLike, n: int) -> NDArray[Any]:
     labels = np.asarray(groups)
     if labels.shape != (n,):
@@ -379,23 +340,3 @@ def _bilinear(width: int, gains: list[int]) -> list[Term]:
     others = [column for column in range(width) if column not in gains]
     single: list[Term] = [(), *((column,) for column in range(width))]
     return single + [(other, gain) for other in others for gain in gains]
-
-
-def _spread(y: Floats, weight: Floats) -> Any:
-    """Standard deviation of targets (n, ...)."""
-    mean = np.average(y, axis=0, weights=weight)
-    return np.sqrt(np.average((y - mean) ** 2, axis=0, weights=weight))
-
-
-def _folds(rows: Floats, groups: NDArray[Any] | None) -> Ints:
-    """Fold of each row: whole groups, dealt in turn; equal rows are one where there is one group.
-
-    A row of weight k is then in one fold, as k equal rows are.
-    """
-    of_row = np.zeros(len(rows), dtype=np.intp)
-    if groups is not None:
-        of_row = np.unique(groups, return_inverse=True)[1]
-    if not of_row.any():
-        of_row = np.unique(rows, axis=0, return_inverse=True)[1].ravel()
-    n_labels = of_row.max() + 1
-    return of_row % (n_labels if n_labels < _FEW_GROUPS else _FOLDS)

@@ -20,7 +20,7 @@ from trajlearn import (
 )
 from trajlearn.dynamics._learner import seeded
 from trajlearn.dynamics._selection import joint_folds
-from trajlearn.dynamics._selection.joint_folds import fit_folds
+from trajlearn.dynamics._selection.joint_folds import FoldFits
 from trajlearn.regressors import _trained, polynomial
 
 FOLDS = [(np.arange(8)[np.arange(8) % 2 != k], np.arange(8)[np.arange(8) % 2 == k]) for k in (0, 1)]
@@ -58,6 +58,11 @@ def forecast(model, ds):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return model.predict(ds)
+
+
+def fit_folds(estimator, ds, folds, *, rng, std=True):
+    fits = FoldFits(estimator, ds, folds, rng=rng, std=std)
+    return fits.fit(range(len(folds)), whole=True), fits.model
 
 
 JOINT = [

@@ -46,6 +46,8 @@ def test_who_is_better_somewhere_stays():
 def test_who_is_as_good_stays_where_it_is_unsure():
     # the same but for chance: who is ahead is not known
     assert stays([1.0] * 6, [1.0] * 6, noise=1.0) == [True, True]
+    # behind by little, and by less than chance explains
+    assert stays([1.0] * 6, [1.01] * 6, n=40, noise=0.1) == [True, True]
     # worse over all, but perhaps better at the first step
     assert stays([1.0] * 6, [1.0, 5, 5, 5, 5, 5], n=5, noise=1.0) == [True, True]
 

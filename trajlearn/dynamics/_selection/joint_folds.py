@@ -16,27 +16,19 @@ from trajlearn.regressors._joint import Job, can_join, fit_jointly
 from trajlearn.regressors.mlp import MLPEnsembleRegressor
 from trajlearn.trajectories import TrajectoryDataset
 
-__all__ = ["FoldFits", "fit_folds"]
+__all__ = ["FoldFits"]
 
 Ints = NDArray[np.intp]
 # fits an unfitted model
 _Fit = Callable[[Any], Any]
 
 
-def fit_folds(
-    estimator: Any,
-    ds: TrajectoryDataset,
-    folds: Sequence[tuple[Ints, Ints]],
-    *,
-    rng: np.random.Generator,
-    std: bool = True,
-    verbose: int = 0,
-) -> tuple[list[Any], Any]:
-    """Fit an estimator on the training episodes of each fold, and on all episodes.
+class FoldFits:
+    """Fits an estimator on the training episodes of folds, now or later, and on all episodes.
 
-    A dynamics estimator over an `MLPEnsembleRegressor` trains the networks of all of them as one,
-    see `trajlearn.regressors._joint`: those of the folds take as many steps as that of all
-    episodes. Anything else is fitted one by one.
+    A dynamics estimator over an `MLPEnsembleRegressor` trains the networks of all that is asked for
+    at once as one, see `trajlearn.regressors._joint`: those of the folds take as many steps as that
+    of all episodes. Anything else is fitted one by one.
 
     An estimator with ``denoise="em"`` or ``latent_velocities=True`` smooths all episodes once, and
     the models of the folds are fitted on smoothed episodes and take over the noise: held-out
@@ -54,28 +46,6 @@ def fit_folds(
     std : bool, default=True
         False: only means are asked of the models of the folds, whose networks then do without a
         separate variance. Their means are the same, and the folds take a seventh less time.
-    verbose : int, default=0
-        1 shows a progress bar.
-
-    Returns
-    -------
-    models : list of estimator
-        One a fold.
-    model : estimator
-        Of all episodes.
-    """
-    fits = FoldFits(estimator, ds, folds, rng=rng, std=std)
-    models = fits.fit(range(len(folds)), whole=True, verbose=verbose)
-    return models, fits.model
-
-
-class FoldFits:
-    """The fits of `fit_folds`, some folds now and others later.
-
-    Parameters
-    ----------
-    estimator, ds, folds, rng, std
-        As in `fit_folds`.
 
     Attributes
     ----------
