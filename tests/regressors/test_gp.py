@@ -104,6 +104,13 @@ def test_recovers_a_sine_and_its_noise():
     assert std.max() < 1.5 * gp.noise_std_[0]
 
 
+def test_what_is_smooth_and_exact_is_learned_to_some_ten_thousandths():
+    X = np.random.default_rng(0).uniform(-2, 2, (120, 2))
+    off = GPRegressor(n_restarts=0).fit(X[:100], np.sin(X[:100, 0]) * X[:100, 1]).predict(X[100:])
+    off -= np.sin(X[100:, 0]) * X[100:, 1]
+    assert np.abs(off).max() < 1e-4
+
+
 def test_finds_the_input_that_does_not_matter():
     X, y, _ = wave(150, 3)
     length_scales = GPRegressor(random_state=0).fit(X, y).length_scales_[0]

@@ -189,7 +189,7 @@ DENOISED = [f"{name}_em" for name in ONE_STEP]
 
 def test_default_members_suit_what_was_logged():
     ds = linear(12, shortest=20, longest=20)
-    assert names(default_members(ds)) == [*ONE_STEP, *DENOISED, "C", "T"]
+    assert names(default_members(ds)) == [*ONE_STEP, *DENOISED, "gp", "C", "T"]
     without = TrajectoryDataset.from_arrays([e.states for e in ds], params=ds.params)
     assert names(default_members(without)) == ["C", "T"]
     # who knows neither actions nor theta takes the controller for constant
@@ -197,17 +197,17 @@ def test_default_members_suit_what_was_logged():
     assert names(default_members(bare)) == ["C", "T"]
     times = [np.cumsum(np.r_[0, np.random.default_rng(0).uniform(0.5, 1, 20)]) for _ in ds]
     irregular = default_members(ds.assign(times=times))
-    assert names(irregular) == [*ONE_STEP, "C", "T"]
+    assert names(irregular) == [*ONE_STEP, "gp", "C", "T"]
     assert all("dt" in m.inputs for name, m in irregular if name != "T")
     assert names(default_members(list(ds))) == names(default_members(ds))
 
 
 def test_default_members_roll_out_by_the_policy_given_or_cloned_or_by_the_log():
     ds = linear(12, shortest=20, longest=20)
-    policies = {name: m.policy for name, m in default_members(ds, policy=gain_policy)[:8]}
+    policies = {name: m.policy for name, m in default_members(ds, policy=gain_policy)[:9]}
     assert set(policies.values()) == {gain_policy}
-    assert {m.policy for _, m in default_members(ds)[:8]} == {"clone"}
-    logged = default_members(ds, rollout_actions="logged")[:8]
+    assert {m.policy for _, m in default_members(ds)[:9]} == {"clone"}
+    logged = default_members(ds, rollout_actions="logged")[:9]
     assert {(m.policy, m.rollout_actions) for _, m in logged} == {(None, "logged")}
 
 
@@ -220,7 +220,7 @@ def test_wide_states_have_no_polynomials_of_high_degree():
 
 def test_members_for_partial_states_are_asked_for():
     ds = linear(12, shortest=20, longest=20)
-    more = dict(default_members(ds, policy=gain_policy, partial=True)[8:-2])
+    more = dict(default_members(ds, policy=gain_policy, partial=True)[9:-2])
     latent = ["poly1_latent", "poly2_latent", "poly3_latent"]
     assert list(more) == [*latent, "poly1_window", "network_window"]
     assert {more["poly1_window"].history, more["network_window"].history} == {5}

@@ -6,7 +6,13 @@ from joblib import parallel_config
 from sklearn.linear_model import LinearRegression
 
 from tests.dynamics.systems import linear
-from trajlearn import HorizonSelector, MLPEnsembleRegressor, OneStepRegressor, TrajectoryRegressor
+from trajlearn import (
+    HorizonSelector,
+    MLPEnsembleRegressor,
+    OneStepRegressor,
+    TrajectoryRegressor,
+    TransitionRelabeler,
+)
 from trajlearn.dynamics._rollouts import rolling
 from trajlearn.dynamics._rollouts.cloned_policy import clone_policy
 from trajlearn.dynamics._selection import shared_policies
@@ -54,6 +60,14 @@ def test_each_policy_is_learned_once(learned):
         assert member.policy == "clone"
         assert member.policy_ is model.estimators_[0].policy_
         assert member.predict(ds).actions == "policy"
+
+
+def test_members_that_are_fitted_on_some_rows_learn_the_policy_from_all(learned):
+    ds = linear(8)
+    some = one_step(2, relabeler=TransitionRelabeler(max_rows=20))
+    model = fitted(ds, one_step(1), some)
+    assert learned == {"shared": [4, 4, 8], "own": []}
+    assert model.estimators_[1].policy_ is model.estimators_[0].policy_
 
 
 def test_forecasts_are_those_of_members_that_learn_their_own():

@@ -7,8 +7,8 @@ from trajlearn.dynamics.lstm import LSTMRegressor
 from trajlearn.dynamics.one_step import OneStepRegressor
 from trajlearn.dynamics.trajectory import TrajectoryRegressor
 from trajlearn.exceptions import MixedSamplingError
-from trajlearn.regressors import polynomial
-from trajlearn.trajectories import TrajectoryDataset, as_dataset
+from trajlearn.regressors import GPRegressor, polynomial
+from trajlearn.trajectories import TrajectoryDataset, TransitionRelabeler, as_dataset
 from trajlearn.trajectories.times import uniform_step
 
 __all__ = ["default_members"]
@@ -17,6 +17,8 @@ __all__ = ["default_members"]
 _CLIP = 1.2
 # a polynomial has at most this many terms, and half as many as there are steps
 _MOST_TERMS = 1000
+# a Gaussian process takes some seconds on so many
+_GP_ROWS = 800
 # past states where one does not say all
 _WINDOW = 5
 
@@ -52,8 +54,9 @@ def default_members(
     list of (str, estimator)
         With actions logged, one-step models: ``poly1``, ``poly2``, ``poly3`` (polynomial least
         squares) and ``network``, each on the states as logged and, where all steps are equal,
-        denoised (``poly1_em``, ...). Always ``C`` (closed loop) and ``T`` (trajectory), which see
-        theta where there are params; without, they take the controller for constant.
+        denoised (``poly1_em``, ...); and ``gp``, a Gaussian process on 800 rows. Always ``C``
+        (closed loop) and ``T`` (trajectory), which see theta where there are params; without, they
+        take the controller for constant.
 
     Examples
     --------
@@ -81,6 +84,10 @@ def default_members(
                 (name + ending, OneStepRegressor(learner, denoise=denoise, **settings))
                 for name, learner in learners
             ]
+        # exact on smooth plants that are no polynomials; noise is not for it, nor are many rows
+        rows = TransitionRelabeler(inputs=settings.get("inputs", "action"), max_rows=_GP_ROWS)
+        process = OneStepRegressor(GPRegressor(n_restarts=0), relabeler=rows, **settings)
+        members.append(("gp", process))
         if partial:
             members += _for_partial_states(learners, settings, irregular)
         if lstm:

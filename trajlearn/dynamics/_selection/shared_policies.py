@@ -13,7 +13,7 @@ from trajlearn.dynamics._rollouts.cloned_policy import ClonedPolicy, clone_polic
 from trajlearn.dynamics.one_step import OneStepRegressor
 from trajlearn.regressors._threads import by_workers
 from trajlearn.regressors.control_law import ControlLawRegressor
-from trajlearn.trajectories import TrajectoryDataset
+from trajlearn.trajectories import TrajectoryDataset, TransitionRelabeler
 
 __all__ = ["SharedPolicies"]
 
@@ -90,13 +90,16 @@ def _settings(member: Any) -> _Settings | None:
     if not isinstance(member, OneStepRegressor) or member.policy != "clone":
         return None
     smooths = member.denoise is not None or member.latent_velocities
-    if smooths or member.relabeler is not None or member.baseline is not None:
+    given = member if member.relabeler is None else member.relabeler
+    # a relabeler of one's own may show something else
+    known = given is member or type(given) is TransitionRelabeler
+    if smooths or member.baseline is not None or not (known and getattr(given, "pad", True)):
         return None
-    inputs = [member.inputs] if isinstance(member.inputs, str) else list(member.inputs)
+    inputs = [given.inputs] if isinstance(given.inputs, str) else list(given.inputs)
     if "action" not in inputs:
         return None
     learner = _learner(member)
-    return type(learner), repr(learner.get_params()), member.history, "dt" in inputs
+    return type(learner), repr(learner.get_params()), given.history, "dt" in inputs
 
 
 def _learner(member: OneStepRegressor) -> Any:
