@@ -59,7 +59,9 @@ class HorizonSelector(ReportsSelection, ForecastsByWeights):
         default members None is "clone": they learn it from the logged actions.
     cv : int, splitter or iterable of (train, test), default=4
         Folds of whole episodes (of groups, where there are); up to five episodes are left out one
-        by one. Your own folds may hold out an episode once at most, and train on others only.
+        by one, and forecast with the policy that is cloned from all of them (few do not determine
+        how actions depend on several gains; it sees what it is judged by). Your own folds may hold
+        out an episode once at most, and train on others only.
     rule : {"pick", "blend"}, default="pick"
     margin : float, default=1.0
         Standard errors by which another member must be better at a horizon.

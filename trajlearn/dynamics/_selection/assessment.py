@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from trajlearn.dynamics._selection.entrant import Assessment, Entrant, judged
-from trajlearn.dynamics._selection.folds import Fold, units_of
+from trajlearn.dynamics._selection.folds import FEW, Fold, units_of
 from trajlearn.dynamics._selection.losses import horizon_losses
 from trajlearn.dynamics._selection.race import enough_to_race, in_the_race
 from trajlearn.dynamics._selection.shared_policies import SharedPolicies
@@ -56,7 +56,7 @@ def assess_all(
     shared = SharedPolicies(members, ds, folds, of_policies, n_jobs)
     units, n_folds = units_of(ds), len(folds)
     # what the first and the second fold say decides who goes on; the rest is trained together
-    alone = 0 if n_kept is None else min(n_folds - 1, 2)
+    alone = 0 if n_kept is None or len(ds) <= FEW else min(n_folds - 1, 2)
     heats = [*(range(k, k + 1) for k in range(alone)), range(alone, n_folds)]
     racing = list(range(len(members)))
     with tqdm(total=len(members) * (n_folds + 1), disable=not verbose, unit="fit") as bar:

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.frozen import FrozenEstimator
 
-from trajlearn.dynamics._selection.folds import Fold
+from trajlearn.dynamics._selection.folds import FEW, Fold
 from trajlearn.dynamics._selection.joint_folds import FoldFits
 from trajlearn.dynamics.forecast import Forecast
 from trajlearn.exceptions import DivergenceWarning, HorizonWarning
 from trajlearn.trajectories import TrajectoryDataset
 
-__all__ = ["Assessment", "Entrant", "judged"]
+__all__ = ["Assessment", "Entrant", "judged", "policy_for_held_out"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -89,14 +89,15 @@ class Entrant:
             models = self._fits.fit(which, whole=whole, policies=policies, verbose=verbose)
             self._model = models[0] if self._fits.model is None else self._fits.model
         fitted = time.perf_counter()
+        policy = policy_for_held_out(self._model, self._ds) if whole else None
         for k, model in zip(which, models):
-            self._forecast(model, self._folds[k][1])
+            self._forecast(model, self._folds[k][1], policy)
         self._seconds[0] += fitted - began
         self._seconds[1] += time.perf_counter() - fitted
 
-    def _forecast(self, model: Any, test: Ints) -> None:
+    def _forecast(self, model: Any, test: Ints, policy: Any) -> None:
         held_out = self._ds[test]
-        self._last = _forecast(model, held_out, self._seed)
+        self._last = _forecast(model, held_out, self._seed, policy)
         missed = self._last.residuals(held_out)
         if self._residuals is None:
             self._residuals = np.full((*self._elapsed.shape, missed.shape[2]), np.nan)
@@ -137,12 +138,32 @@ def judged(
     return entrant
 
 
-def _forecast(model: Any, ds: TrajectoryDataset, seed: int) -> Forecast:
+def policy_for_held_out(model: Any, ds: TrajectoryDataset) -> Any:
+    """With few episodes the policy that a member has cloned from all of them; else None, its own.
+
+    How actions depend on four gains cannot be learned from four episodes, but often from five.
+    Members that clone the policy would be told apart by what they make of a wrong one, and not by
+    what they know of the plant; so it may have seen the episodes that they are judged by.
+
+    Parameters
+    ----------
+    model : estimator
+        Fitted on all episodes.
+    ds : TrajectoryDataset
+        All of them.
+    """
+    if getattr(model, "policy", None) != "clone" or len(ds) > FEW:
+        return None
+    return model.policy_
+
+
+def _forecast(model: Any, ds: TrajectoryDataset, seed: int, policy: Any) -> Forecast:
     with warnings.catch_warnings():
         # who diverges is not chosen, and the report says who did
         for category in (DivergenceWarning, HorizonWarning):
             warnings.simplefilter("ignore", category)
-        found = model.predict(ds, random_state=seed)
+        asked = {} if policy is None else {"policy": policy}
+        found = model.predict(ds, random_state=seed, **asked)
     if not isinstance(found, Forecast):
         raise TypeError(
             f"{type(model).__name__} predicts {type(found).__name__}, not a Forecast: give "

@@ -10,12 +10,12 @@ from sklearn.model_selection import GroupKFold, check_cv
 
 from trajlearn.trajectories import TrajectoryDataset
 
-__all__ = ["Fold", "held_out_folds", "units_of"]
+__all__ = ["FEW", "Fold", "held_out_folds", "units_of"]
 
 Ints = NDArray[np.intp]
 Fold = tuple[Ints, Ints]
-# so few episodes (groups) are left out one by one
-_FEW = 5
+#: So few episodes (groups) are left out one by one.
+FEW = 5
 
 
 def units_of(ds: TrajectoryDataset) -> Ints:
@@ -46,7 +46,7 @@ def held_out_folds(ds: TrajectoryDataset, cv: Any, rng: np.random.Generator) -> 
         )
     splitter = cv
     if isinstance(cv, Integral):
-        n_folds = n_units if n_units <= _FEW else min(int(cv), n_units)
+        n_folds = n_units if n_units <= FEW else min(int(cv), n_units)
         splitter = GroupKFold(n_folds, shuffle=True, random_state=seed)
     with warnings.catch_warnings():
         # a splitter that has no use for groups was chosen knowingly
