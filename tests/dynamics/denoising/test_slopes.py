@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sklearn.cross_decomposition import PLSRegression
 from sklearn.linear_model import LinearRegression, Ridge
 from sklearn.neighbors import KNeighborsRegressor
 from sklearn.pipeline import make_pipeline
@@ -33,6 +34,9 @@ LEARNERS = {
     "with a constant": make_pipeline(PolynomialFeatures(2), Ridge(1e-3)),
     "scaled monomials": make_pipeline(PolynomialFeatures(2), StandardScaler(), LinearRegression()),
     "interactions": make_pipeline(PolynomialFeatures(3, interaction_only=True), Ridge()),
+    # neither has slopes of its own: the coefficients of the second are those of centred columns
+    "a step alone": make_pipeline(LinearRegression()),
+    "partial least squares": make_pipeline(PolynomialFeatures(2), PLSRegression(2)),
     "silu": network(),
     "tanh ensemble": network(activation="tanh", n_members=3),
     "probabilistic": network(probabilistic=True, activation="relu"),

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from sklearn.linear_model import LinearRegression
+from sklearn.pipeline import make_pipeline
 
 from tests.dynamics.systems import A, B, quadratic
 from trajlearn import HorizonSelector, OneStepRegressor, TrajectoryDataset
@@ -40,3 +41,17 @@ def test_few_episodes_leave_a_given_policy_alone():
         return np.ones((len(states), 1))
 
     assert worst(fed_back(5), policy=wrong) > 1e-2
+
+
+def test_closed_loops_and_pipelines_are_judged_beside_clones():
+    ds = fed_back(5)
+    one = OneStepRegressor(LinearRegression(), policy="clone", policy_estimator=quadratic())
+    members = [
+        ("D", one),
+        ("in a pipeline", make_pipeline(one)),
+        ("C", OneStepRegressor(LinearRegression(), inputs="params", policy="clone")),
+    ]
+    found = HorizonSelector(members, policy="clone", random_state=0).fit(ds)
+    error = found.cv_errors_.groupby("member")["mean"].max()
+    assert error["D"] == error["in a pipeline"] < 1e-16
+    assert error["C"] > 1e-5

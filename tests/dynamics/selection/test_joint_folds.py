@@ -226,3 +226,14 @@ def test_without_noise_folds_are_fitted_on_what_was_logged():
         np.testing.assert_array_equal(
             forecast(one, ds).mean, forecast(clone(estimator).fit(ds[train]), ds).mean
         )
+
+
+@pytest.mark.parametrize("denoise", [None, "em"])
+def test_networks_of_folds_take_as_many_steps_as_that_of_all(denoise):
+    rng = np.random.default_rng(0)
+    ds = linear(20, shortest=20, longest=20).add_noise(0.1, random_state=0)
+    folds = [(np.arange(5, 20), np.arange(5))]
+    network = MLPEnsembleRegressor(hidden_layer_sizes=(4,), n_members=1, max_epochs=9, batch_size=8)
+    fits = FoldFits(OneStepRegressor(network, denoise=denoise), ds, folds, rng=rng)
+    (fold,) = fits.fit([0], whole=True)
+    assert fold.estimator_.n_steps_ == fits.model.estimator_.n_steps_

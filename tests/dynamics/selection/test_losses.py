@@ -166,6 +166,26 @@ def test_only_a_sure_gain_overrides_the_best_overall():
     assert (pick(losses, 4.0).weights[:, best] == 1).all()
 
 
+def test_who_was_judged_by_a_part_of_the_episodes_is_chosen_nowhere():
+    # the other episodes end before what the part reaches
+    whole, left = constant(1.0, n=12), constant(0.1, n=12)
+    whole[4:, 3:] = NAN
+    left[4:] = NAN
+    losses = losses_of(whole, left)
+    assert losses.eligible.tolist() == [[True] * 6, [False] * 6]
+    assert (pick(losses, 1.0).weights[:, 0] == 1).all()
+
+
+@pytest.mark.parametrize("reach", range(100, 131))
+def test_nobody_is_chosen_beyond_what_he_forecasts(reach):
+    far, near = constant(1.0, steps=200), constant(0.1, steps=200)
+    near[:, reach:] = NAN
+    losses = losses_of(far, near)
+    weights = step_weights(pick(losses, 1.0), losses, 200)
+    assert (weights[reach:, 0] == 1).all()
+    assert (weights[: reach - 4, 1] == 1).all()
+
+
 def test_one_episode_gone_wrong_decides_nothing():
     good, bad = constant(1.0, n=20), constant(1.5, n=20)
     good[0] = 30.0

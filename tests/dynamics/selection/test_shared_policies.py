@@ -165,3 +165,13 @@ def test_the_number_of_workers_changes_nothing():
     with parallel_config("threading"):
         together = fitted(ds, *members, n_jobs=2)
     np.testing.assert_array_equal(alone.predict(ds).mean, together.predict(ds).mean)
+
+
+def test_what_one_member_alone_is_refused_is_refused_of_several():
+    network = MLPEnsembleRegressor(hidden_layer_sizes=(4,), max_steps=5, batch_size=8)
+    member = OneStepRegressor(network, loss_horizon=2, history=2, policy="clone")
+    with pytest.raises(ValueError, match="policy='clone' knows slopes") as alone:
+        member.fit(linear(8))
+    with pytest.raises(ValueError, match="policy='clone' knows slopes") as shared:
+        fitted(linear(8), member, member)
+    assert str(alone.value) == str(shared.value)

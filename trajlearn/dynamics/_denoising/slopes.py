@@ -141,6 +141,8 @@ def _padded(values: NDArray[Any], device: torch.device, *, rows: bool = True) ->
 
 def _of_polynomial(learner: Pipeline) -> _LearnerSlopes | None:
     """Slopes of a linear model of monomials: each has a multiple of a lower one for a slope."""
+    if len(learner.steps) == 1:
+        return None
     features, *between, linear = (step for _, step in learner.steps)
     scaled = len(between) == 1 and isinstance(between[0], StandardScaler)
     if not isinstance(features, PolynomialFeatures) or (between and not scaled):
@@ -175,4 +177,8 @@ def _of_polynomial(learner: Pipeline) -> _LearnerSlopes | None:
         steep = (monomials @ flat).reshape(len(rows), *constant.shape)
         return monomials @ coef.T + shift, steep + constant
 
-    return slopes
+    # others have coefficients, too, of centred columns or behind a link
+    probe = np.random.default_rng(0).normal(size=(5, powers.shape[1]))
+    given = learner.predict(probe).reshape(len(probe), -1)
+    same = np.allclose(slopes(probe)[0], given, atol=1e-6 * np.abs(given).max())
+    return slopes if same else None

@@ -24,6 +24,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from trajlearn.dynamics._relative import curve, relative_to
+from trajlearn.dynamics._rollouts.cloned_policy import ClonedPolicy
 from trajlearn.dynamics._rollouts.unrolled_steps import Stretches, Unrolled
 from trajlearn.dynamics.scaling import BlockScaler
 from trajlearn.regressors._batches import row_batches
@@ -74,7 +75,7 @@ def check_unrollable(model: Any) -> None:
         why = f"needs a TransitionRelabeler, not {_name(model.relabeler_)}"
     elif not isinstance(model.scaler_, BlockScaler) or model.scaler_.features is not None:
         why = "takes slopes through the scaler: give a BlockScaler without features="
-    elif model._clones() and model._history() > 1:
+    elif _clones(model) and model._history() > 1:
         why = (
             "with policy='clone' knows slopes of actions in the state alone: leave history="
             f"{model._history()} out, or give a policy, or rollout_actions='logged'"
@@ -82,6 +83,11 @@ def check_unrollable(model: Any) -> None:
         why = None if model.rollout_actions == "logged" else why
     if why is not None:
         raise ValueError(f"loss_horizon={model.loss_horizon} {why}.")
+
+
+def _clones(model: Any) -> bool:
+    """Whether its policy is cloned now, or was before."""
+    return bool(model._clones()) or isinstance(model.policy, ClonedPolicy)
 
 
 def train_on_rollouts(

@@ -11,7 +11,7 @@ from trajlearn.regressors import GPRegressor, polynomial
 from trajlearn.trajectories import TrajectoryDataset, TransitionRelabeler, as_dataset
 from trajlearn.trajectories.times import uniform_step
 
-__all__ = ["default_members"]
+__all__ = ["clipped_to", "default_members"]
 
 # predicted states stay within this multiple of the range that states seem to have
 _CLIP = 1.2
@@ -68,8 +68,7 @@ def default_members(
     """
     ds = as_dataset(ds)
     irregular = _irregular(ds)
-    # the range of n uniform numbers falls short of the whole by this factor
-    clip = _CLIP * (len(ds) + 1) / max(len(ds) - 1, 1)
+    clip = clipped_to(len(ds))
     members: list[tuple[str, Any]] = []
     if ds.actions is not None:
         settings: dict[str, Any] = {"clip_states": clip, "rollout_actions": rollout_actions}
@@ -92,7 +91,8 @@ def default_members(
             members += _for_partial_states(learners, settings, irregular)
         if lstm:
             known = {"policy": policy} if callable(policy) else {}
-            members.append(("lstm", LSTMRegressor(clip_states=clip, **known)))
+            recurrent = LSTMRegressor(rollout_actions=rollout_actions, clip_states=clip, **known)
+            members.append(("lstm", recurrent))
     closed: Any = ("params", "dt") if irregular else "params"
     members.append(("C", OneStepRegressor(inputs=closed, clip_states=clip)))
     members.append(("T", TrajectoryRegressor()))
@@ -124,6 +124,12 @@ def _learners(ds: TrajectoryDataset, irregular: bool) -> list[tuple[str, Any]]:
     most = min(_MOST_TERMS, int(ds.lengths.sum()) // 2)
     degrees = [degree for degree in (1, 2, 3) if comb(width + degree, degree) <= most]
     return [*((f"poly{k}", polynomial(degree=k)) for k in degrees), ("network", None)]
+
+
+def clipped_to(n_episodes: int) -> float:
+    """Multiple of the training range within which roll-outs stay."""
+    # the range of n uniform numbers falls short of the whole by this factor
+    return _CLIP * (n_episodes + 1) / max(n_episodes - 1, 1)
 
 
 def _irregular(ds: TrajectoryDataset) -> bool:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.frozen import FrozenEstimator
 
+from trajlearn.dynamics._members import unwrapped
 from trajlearn.dynamics._selection.folds import FEW, Fold
 from trajlearn.dynamics._selection.joint_folds import FoldFits
 from trajlearn.dynamics.forecast import Forecast
@@ -152,9 +153,11 @@ def policy_for_held_out(model: Any, ds: TrajectoryDataset) -> Any:
     ds : TrajectoryDataset
         All of them.
     """
+    model = unwrapped(model)
     if getattr(model, "policy", None) != "clone" or len(ds) > FEW:
         return None
-    return model.policy_
+    # a closed loop has none
+    return getattr(model, "policy_", None)
 
 
 def _forecast(model: Any, ds: TrajectoryDataset, seed: int, policy: Any) -> Forecast:

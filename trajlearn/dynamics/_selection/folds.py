@@ -52,11 +52,7 @@ def held_out_folds(ds: TrajectoryDataset, cv: Any, rng: np.random.Generator) -> 
         # a splitter that has no use for groups was chosen knowingly
         warnings.filterwarnings("ignore", "The groups parameter is ignored", UserWarning)
         folds = list(check_cv(splitter).split(ds, groups=units))
-    every = np.arange(len(ds))
-    # a mask is as good as indices
-    folds = [
-        tuple(every[np.asarray(some)] if len(some) else every[:0] for some in f) for f in folds
-    ]
+    folds = [(_indices(train, len(ds)), _indices(test, len(ds))) for train, test in folds]
     _check(folds)
     return folds
 

@@ -95,8 +95,7 @@ class FoldFits:
         if self.model is None and whole:
             *models, self.model = _fit_all(self._unfitted, [*fits, every], plain, verbose)
             return models
-        longest = every if self.model is None else None
-        return _fit_all(self._unfitted, fits, plain, verbose, as_long_as=longest)
+        return _fit_all(self._unfitted, fits, plain, verbose, as_long_as=every)
 
     def _smooth(self) -> None:
         self.model = clone(self._unfitted).fit(self._ds)

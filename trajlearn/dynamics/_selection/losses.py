@@ -152,7 +152,16 @@ def horizon_losses(errors: Floats, units: Ints, bandwidth: float) -> HorizonLoss
     smooth = averaged(np.minimum(errors, DIVERGENCE_RANGES**2), known, knots, bandwidth)
     reached = known[..., knots - 1]
     count = reached.sum(axis=1)
+    edges = np.concatenate([[0.5], np.sqrt(knots[1:] * knots[:-1]), [n_steps + 0.5]])
     eligible = (count == count.max(axis=0)) & (count > 0)
+    # a knot is chosen for all the steps it stands for
+    begins = np.ceil(edges[:-1]).astype(np.intp) - 1
+    of_step = known.sum(axis=1)
+    whole = eligible & np.logical_and.reduceat(of_step == of_step.max(axis=0), begins, axis=1)
+    eligible = np.where(whole.any(axis=0), whole, eligible)
+    # who has left the race was judged by fewer episodes, and is fitted on a part of them
+    judged = known.any(axis=2).sum(axis=1)
+    eligible &= (judged == judged.max())[:, None]
     smooth = np.maximum(smooth, _EXACT)
     medians = np.where(eligible, _medians(np.where(reached, smooth, np.nan)), np.inf)
     least = np.where(eligible[:, None] & reached, smooth, np.inf).min(axis=0)
@@ -160,7 +169,6 @@ def horizon_losses(errors: Floats, units: Ints, bandwidth: float) -> HorizonLoss
     least = np.where(np.isfinite(least), least, 1.0)
     typical = np.sqrt(least * medians.min(axis=0))
     values = np.where(reached, np.log1p(smooth / typical), np.nan)
-    edges = np.concatenate([[0.5], np.sqrt(knots[1:] * knots[:-1]), [n_steps + 0.5]])
     return HorizonLosses(knots, values, units, eligible, np.diff(edges), typical)
 
 
