@@ -7,8 +7,10 @@ from sklearn.linear_model import LinearRegression
 
 from tests.dynamics.systems import SMALL, Affine, linear
 from trajlearn import (
+    CalibratedForecaster,
     DirectRewardGP,
     DirectRewardNN,
+    HorizonSelector,
     OneStepRegressor,
     SubtrajectoryRelabeler,
     Trajectory,
@@ -54,6 +56,33 @@ def test_a_bad_state_is_found_when_the_episode_is_built(model, bad):
     states[3, 1] = bad
     with pytest.raises(InvalidEpisodeError, match=r"states is (nan|inf) at row 3, column 1"):
         model.fit([Trajectory(states, params=[0.0, 0.0])])
+
+
+@pytest.mark.parametrize("wrong", [-1, 2.5, True, "many"])
+@pytest.mark.parametrize("kind", ["T", "D", "selector", "calibrated"])
+def test_a_number_of_samples_that_is_none(kind, wrong):
+    ds = equal(12)
+    member = OneStepRegressor(LinearRegression())
+    model = {
+        "T": TrajectoryRegressor(LinearRegression()),
+        "D": member,
+        "selector": HorizonSelector([("D", member)]),
+        "calibrated": CalibratedForecaster(member),
+    }[kind].fit(ds)
+    with pytest.raises(ValueError, match="give the number of trajectories"):
+        model.predict(ds, n_samples=wrong)
+    given = {"actions": ds[0].actions[None, :2]} if kind != "T" else {}
+    with pytest.raises(ValueError, match="give the number of trajectories"):
+        model.predict_trajectory(
+            ds[0].states[:1], horizons=[1.0, 2.0], params=ds.params[:1], n_samples=wrong, **given
+        )
+
+
+@pytest.mark.parametrize("none", [0, None])
+def test_no_samples_may_be_asked_for(none):
+    ds = equal()
+    model = OneStepRegressor(LinearRegression()).fit(ds)
+    assert model.predict(ds, n_samples=none).samples is None
 
 
 @EVERY_MODEL

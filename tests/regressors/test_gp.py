@@ -1,5 +1,6 @@
 import copy
 import pickle
+import warnings
 
 import joblib
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from linear_operator.utils.warnings import NumericalWarning
 from scipy import sparse
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
@@ -16,6 +18,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteK
 from sklearn.model_selection import GridSearchCV
 
 from tests.sklearn_checks import run_checks
+from trajlearn.regressors._gp_models import cholesky
 from trajlearn.regressors.gp import GPRegressor
 
 KERNELS = ["rbf", "matern12", "matern32", "matern52"]
@@ -109,6 +112,16 @@ def test_what_is_smooth_and_exact_is_learned_to_some_ten_thousandths():
     off = GPRegressor(n_restarts=0).fit(X[:100], np.sin(X[:100, 0]) * X[:100, 1]).predict(X[100:])
     off -= np.sin(X[100:, 0]) * X[100:, 1]
     assert np.abs(off).max() < 1e-4
+
+
+def test_jitter_is_told_if_it_is_more_than_exact_data_need():
+    nearly = torch.ones(6, 6, dtype=torch.float64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        factor = cholesky(nearly)
+    np.testing.assert_allclose(factor @ factor.T, nearly, atol=1e-7)
+    with pytest.warns(NumericalWarning, match="jitter"):
+        cholesky(nearly - 5e-7 * torch.eye(6))
 
 
 def test_finds_the_input_that_does_not_matter():

@@ -3,6 +3,7 @@
 import warnings
 from abc import abstractmethod
 from dataclasses import dataclass
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from trajlearn.trajectories import TrajectoryDataset, as_dataset
 from trajlearn.trajectories._relabeler import generator
 from trajlearn.trajectories.rewards import Reward, step_rewards
 
-__all__ = ["DIVERGENCE_RANGES", "Forecaster", "Prediction", "Request"]
+__all__ = ["DIVERGENCE_RANGES", "Forecaster", "Prediction", "Request", "check_n_samples"]
 
 Floats = NDArray[np.float64]
 
@@ -44,6 +45,19 @@ class Request:
     return_std: bool
     n_samples: int | None
     rng: np.random.Generator
+
+    def __post_init__(self) -> None:
+        check_n_samples(self.n_samples)
+
+
+def check_n_samples(n_samples: Any) -> None:
+    """Raise an error for what is no number of trajectories."""
+    counts = isinstance(n_samples, Integral) and not isinstance(n_samples, bool)
+    if n_samples is not None and not (counts and n_samples >= 0):
+        raise ValueError(
+            f"n_samples = {n_samples!r}: give the number of trajectories to draw, such as 100, or "
+            "None to draw none."
+        )
 
 
 class Forecaster(BaseEstimator):

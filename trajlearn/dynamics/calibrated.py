@@ -13,6 +13,7 @@ from sklearn.utils.validation import check_is_fitted
 
 from trajlearn._sklearn import HasMethods, Interval, StrOptions, fit_context
 from trajlearn.dynamics._episode_arguments import in_groups
+from trajlearn.dynamics._forecaster import check_n_samples
 from trajlearn.dynamics._meta import ForecasterAround, forecaster_can
 from trajlearn.dynamics._shared_states import shared_states
 from trajlearn.dynamics._uncertainty.calibration import Residuals, crps_rescaling
@@ -299,6 +300,7 @@ class CalibratedForecaster(ForecasterAround):
             If actions come from elsewhere than in calibration.
         """
         check_is_fitted(self)
+        check_n_samples(n_samples)
         uncertain = return_std or bool(n_samples)
         asked = uncertain and self.has_std_
         raw = super().predict(X, asked, random_state=random_state, **settings)
@@ -332,6 +334,7 @@ class CalibratedForecaster(ForecasterAround):
         Forecast
         """
         check_is_fitted(self)
+        check_n_samples(n_samples)
         uncertain = return_std or bool(n_samples)
         raw = super().predict_trajectory(
             initial_states,

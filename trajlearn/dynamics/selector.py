@@ -90,7 +90,7 @@ class HorizonSelector(ReportsSelection, ForecastsByWeights):
     names_ : tuple of str
     estimators_ : list of estimator
         Members, fitted on all episodes. One that left the race was fitted on the training
-        episodes of the first fold only (one that smooths episodes, on all), and is never chosen.
+        episodes of one fold only (one that smooths episodes, on all), and is never chosen.
     best_ : str
         The member of least loss over all horizons.
     weights_ : ndarray of shape (H, M)
@@ -247,7 +247,7 @@ class HorizonSelector(ReportsSelection, ForecastsByWeights):
         names = tuple(name for name, _ in members)
         self.state_names_, self.state_range_, columns = states_of(assessed, ds)
         scaled, self._errors = errors_in_ranges(assessed, ds)
-        self._units = units_of(ds)
+        self._units, self._bandwidth = units_of(ds), self.bandwidth
         losses = self._losses()
         self.names_, self.estimators_ = names, [a.model for a in assessed]
         choice = self._chosen(losses, scaled)

@@ -4,6 +4,7 @@ L-BFGS sees a flat vector ``theta = log([length scales (d), signal variance, noi
 the covariance functions and their derivatives are gpytorch's.
 """
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -110,14 +111,23 @@ def _gradient(kernel: Any) -> list[Floats]:
     return [_grad(kernel.base_kernel.raw_lengthscale), _grad(kernel.raw_outputscale)]
 
 
+def cholesky(matrix: torch.Tensor) -> torch.Tensor:
+    """Lower Cholesky factor; a little is added to the diagonal where round-off asks for it."""
+    from linear_operator.utils.cholesky import psd_safe_cholesky
+
+    with warnings.catch_warnings():
+        # less than the noise of exact data need not be told
+        warnings.filterwarnings("ignore", r"A not p\.d\., added jitter of 1\.0e-0[78]")
+        factor: torch.Tensor = psd_safe_cholesky(matrix)
+    return factor
+
+
 def exact_objective(kernel: Any, inputs: Floats, targets: Floats) -> Objective:
     """Minus the log marginal likelihood, Rasmussen and Williams (2006), eq. 5.8 and 5.9.
 
     The derivative with respect to the covariance matrix is written down, which costs a
     quarter of differentiating through the Cholesky factor; autograd does the rest.
     """
-    from linear_operator.utils.cholesky import psd_safe_cholesky
-
     x, y = torch.tensor(inputs), torch.tensor(targets)  # copies, aligned: same data, same bits
     n = len(y)
 
@@ -128,7 +138,7 @@ def exact_objective(kernel: Any, inputs: Floats, targets: Floats) -> Objective:
         with torch.no_grad():
             noisy = covariance.detach().clone()
             noisy.diagonal().add_(noise)
-            factor = psd_safe_cholesky(noisy)
+            factor = cholesky(noisy)
             weights = torch.cholesky_solve(y[:, None], factor)[:, 0]
             value = 0.5 * y @ weights + factor.diagonal().log().sum() + 0.5 * n * _LOG_2PI
             slope = torch.cholesky_inverse(factor)
@@ -146,8 +156,6 @@ def sparse_objective(kernel: Any, inputs: Floats, targets: Floats, m: int) -> Ob
     For Gaussian noise the best variational distribution is known in closed form, so no
     steps are spent on it. The points follow theta in the flat vector.
     """
-    from linear_operator.utils.cholesky import psd_safe_cholesky
-
     x, y = torch.tensor(inputs), torch.tensor(targets)  # copies, aligned: same data, same bits
     n, d = x.shape
     n_theta = d + 2
@@ -159,10 +167,10 @@ def sparse_objective(kernel: Any, inputs: Floats, targets: Floats, m: int) -> Ob
         points = torch.tensor(flat[n_theta:].reshape(m, d), requires_grad=True)
         noise = log_noise.exp()
         signal = kernel.outputscale
-        factor = psd_safe_cholesky(kernel(points).to_dense() + JITTER * signal * eye)
+        factor = cholesky(kernel(points).to_dense() + JITTER * signal * eye)
         cross = kernel(points, x).to_dense()
         a = torch.linalg.solve_triangular(factor, cross, upper=False) / noise.sqrt()
-        inner = psd_safe_cholesky(eye + a @ a.T)
+        inner = cholesky(eye + a @ a.T)
         c = torch.linalg.solve_triangular(inner, (a @ y)[:, None], upper=False) / noise.sqrt()
         value = (
             0.5 * n * (_LOG_2PI + log_noise)

@@ -13,7 +13,7 @@ from scipy.linalg import cho_solve, eigh, solve_triangular
 from scipy.linalg.lapack import dtrtri
 from scipy.spatial.distance import cdist
 
-from trajlearn.regressors._gp_models import JITTER, Floats, Hyperparameters
+from trajlearn.regressors._gp_models import JITTER, Floats, Hyperparameters, cholesky
 from trajlearn.regressors._threads import threads_for
 
 # rows evaluated at once
@@ -147,10 +147,7 @@ class Explained:
 
 
 def _cholesky(matrix: Floats) -> Floats:
-    """Lower Cholesky factor; a little is added to the diagonal where round-off asks for it."""
-    from linear_operator.utils.cholesky import psd_safe_cholesky
-
-    factor: Floats = psd_safe_cholesky(torch.tensor(matrix)).numpy()
+    factor: Floats = cholesky(torch.tensor(matrix)).numpy()
     return factor
 
 

@@ -186,6 +186,15 @@ def test_nobody_is_chosen_beyond_what_he_forecasts(reach):
     assert (weights[: reach - 4, 1] == 1).all()
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("margin", [0.0, 1.0])
+def test_one_unit_overrides_nothing(margin):
+    one, other = constant(1.0), constant(2.0)
+    other[1:, 4:] = one[1:, 4:] = NAN
+    other[:, 4:] /= 4
+    assert (pick(losses_of(one, other), margin).weights[:, 0] == 1).all()
+
+
 def test_one_episode_gone_wrong_decides_nothing():
     good, bad = constant(1.0, n=20), constant(1.5, n=20)
     good[0] = 30.0

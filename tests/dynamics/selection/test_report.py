@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 from sklearn.ensemble import RandomForestRegressor
 from sklearn.frozen import FrozenEstimator
@@ -10,10 +11,12 @@ from sklearn.frozen import FrozenEstimator
 from tests.dynamics.crossing import Off, decays
 from tests.dynamics.systems import gain_policy, linear
 from trajlearn import (
+    LSTMRegressor,
     OneStepRegressor,
     SubtrajectoryRelabeler,
     TrajectoryDataset,
     TrajectoryRegressor,
+    TransitionRelabeler,
 )
 from trajlearn.dynamics import selector as module
 from trajlearn.dynamics._selection import diagnosis
@@ -145,6 +148,40 @@ def test_without_both_kinds_nothing_is_said_of_partial_states():
     assert "no comparison" in sentence(selector(Off()).fit(decays()), "Partial states:")
 
 
+def test_noise_that_latent_members_found_is_told():
+    ds = oscillations(["x"]).add_noise(0.05, random_state=0)
+    latent = OneStepRegressor(polynomial(1), latent_velocities=True)
+    model = selector(latent, OneStepRegressor(polynomial(1))).fit(ds)
+    assert "m0 found measurement noise" in sentence(model, "Noise:")
+    noise = model.report(by="member")["measurement_noise"]
+    found = model.estimators_[0].measurement_noise_
+    assert noise["m0"] == pytest.approx(100 * found[0] / np.ptp(ds.states))
+    assert noise["m0"] > 0.1
+    assert np.isnan(noise["m1"])
+
+
+@pytest.mark.parametrize(
+    "member",
+    [
+        LSTMRegressor(hidden_size=4, max_steps=5),
+        OneStepRegressor(polynomial(1), history=3),
+        OneStepRegressor(polynomial(1), relabeler=TransitionRelabeler(history=3)),
+    ],
+    ids=["LSTM", "history", "relabeler"],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_members_that_remember_see_more_than_a_state(member):
+    ds = linear(8)
+    evidence = selector(member, OneStepRegressor(polynomial(1))).fit(ds)._evidence()
+    assert [diagnosis._sees(evidence, i) for i in (0, 1)] == ["more", "state"]
+
+
+def test_what_is_told_is_what_was_fitted():
+    model = selector(Off(0.1, 0.4), Off(0.2, 0.2), bandwidth=0.3).fit(decays(noise=0.1))
+    report = model.report()
+    pd.testing.assert_frame_equal(model.set_params(bandwidth=0.0).report(), report)
+
+
 def test_reach_is_how_far_the_median_is_off_by_less_than_a_tenth():
     ds = decays(noise=0.0)
     width = np.ptp(ds.states)
@@ -233,6 +270,9 @@ def test_members_for_partial_states_are_asked_for():
 def test_the_recurrent_member_is_asked_for():
     ds = linear(4, shortest=20, longest=20)
     assert "lstm" in names(default_members(ds, lstm=True))
+    for source in ("policy", "logged"):
+        members = dict(default_members(ds, policy=gain_policy, lstm=True, rollout_actions=source))
+        assert {members[name].rollout_actions for name in ("lstm", "poly1")} == {source}
 
 
 @pytest.mark.filterwarnings("ignore")

@@ -43,9 +43,15 @@ def pick(losses: HorizonLosses, margin: float) -> Choice:
     means = losses.means
     rival = means.argmin(axis=0)
     gain, error = losses.gain(rival, np.full_like(rival, best))
-    better = (gain > margin * error) | ~losses.eligible[best]
+    better = _surely(gain, error, margin) | ~losses.eligible[best]
     chosen = np.where(better, rival, best)
     return Choice(best, np.eye(len(means))[chosen])
+
+
+def _surely(gain: Floats, error: Floats, margin: float) -> NDArray[np.bool_]:
+    """Where a gain is beyond a margin of standard errors; one unit alone has an infinite one."""
+    known = np.isfinite(error)
+    return known & (gain > margin * np.where(known, error, 0.0))
 
 
 def blend(
@@ -77,7 +83,7 @@ def blend(
     alone = losses.values[picked.weights.argmax(axis=1), :, at].T
     gain, error = paired(alone - np.log1p(errors / losses.typical), losses.units)
     weights = picked.weights.copy()
-    better = gain > 2 * margin * error
+    better = _surely(gain, error, 2 * margin)
     weights[better] = 0.0
     weights[np.ix_(better, few)] = found[better]
     return Choice(picked.best, weights)

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from trajlearn.dynamics._members import unwrapped
 from trajlearn.dynamics._rollouts.rolling import RollingEstimator
 from trajlearn.dynamics._selection.report import Evidence, measurement_noise
+from trajlearn.dynamics.lstm import LSTMRegressor
 from trajlearn.dynamics.trajectory import TrajectoryRegressor
 
 __all__ = ["diagnosis"]
@@ -108,8 +109,9 @@ def _sees(evidence: Evidence, i: int) -> str:
         return "more"
     if not isinstance(model, RollingEstimator) or "action" not in getattr(model, "layout_", ()):
         return "unknown"
-    memory = getattr(model, "history", 1) > 1 or getattr(model, "latent_velocities", False)
-    return "more" if memory else "state"
+    latent = getattr(model, "latent_velocities", False)
+    remembers = isinstance(model, LSTMRegressor) or model._history() > 1
+    return "more" if latent or remembers else "state"
 
 
 def _ratio(evidence: Evidence, one: int, other: int) -> float:

@@ -31,8 +31,8 @@ class Assessment:
     ----------
     name : str
     model : estimator
-        Fitted on all episodes; of a member that left the race, on those of the first fold, unless
-        it smooths episodes.
+        Fitted on all episodes; of a member that left the race, on those of the fold that it left
+        after, unless it smooths episodes.
     residuals : ndarray of shape (n, H, k)
         Logged minus forecast states, of the states that are logged; NaN where there is nothing
         to compare, inf from a divergence on.

@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 class ReportsSelection:
     """Tables and words on the held-out errors that a choice rests on."""
 
-    bandwidth: float
+    _bandwidth: float
     names_: tuple[str, ...]
     estimators_: list[Any]
     weights_: Floats
@@ -89,4 +89,4 @@ class ReportsSelection:
         )
 
     def _losses(self) -> HorizonLosses:
-        return horizon_losses(self._errors, self._units, self.bandwidth)
+        return horizon_losses(self._errors, self._units, self._bandwidth)

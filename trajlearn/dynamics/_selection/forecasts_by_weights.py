@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted
 
+from trajlearn.dynamics._forecaster import check_n_samples
 from trajlearn.dynamics._meta import MetaForecaster
 from trajlearn.dynamics._selection.held_out_noise import HeldOutNoise
 from trajlearn.dynamics._selection.mixed_forecast import Part, cut_after, mixed, shortened
@@ -163,6 +164,7 @@ class ForecastsByWeights(NamedMembers, MetaForecaster):
         self, steps: Ints, ask: Asked, return_std: bool, n_samples: int | None, random_state: Any
     ) -> Forecast:
         """Mixture of the members that have weight at some of the steps (H,), counted from 0."""
+        check_n_samples(n_samples)
         weights = self.weights_[np.minimum(steps, len(self.weights_) - 1)]
         rng = np.random.default_rng() if random_state is None else generator(random_state)
         seeds = rng.integers(2**31, size=len(self.names_))

@@ -167,9 +167,9 @@ def by_member(evidence: Evidence) -> "pd.DataFrame":
 
 
 def measurement_noise(model: Any) -> Floats | None:
-    """Standard deviation by state that a denoised model found; None of those that do not look."""
+    """Standard deviation by state that a smoothing model found; None of those that do not look."""
     model = unwrapped(model)
-    if getattr(model, "denoise", None) is None or not hasattr(model, "noisy_"):
+    if not hasattr(model, "noisy_"):
         return None
     found = np.asarray(model.measurement_noise_, dtype=np.float64)
     return found if model.noisy_ else np.zeros_like(found)
