@@ -20,6 +20,8 @@ from trajlearn import (
     TrajectoryDataset,
     default_members,
 )
+from trajlearn.dynamics._selection.default_members import clipped_to
+from trajlearn.dynamics._selection.entrant import policy_for_held_out
 from trajlearn.dynamics._selection.joint_folds import FoldFits
 from trajlearn.regressors import polynomial
 from trajlearn.regressors.control_law import ControlLawRegressor
@@ -47,7 +49,7 @@ def members_of(regime: Regime, ds: TrajectoryDataset, policy: Any, mode: str) ->
         sees = OneStepRegressor(
             polynomial(degree=1),
             policy=policy,
-            clip_states=1.2,
+            clip_states=clipped_to(len(ds)),
             denoise="em",
             policy_sees="measurements",
         )
@@ -189,7 +191,7 @@ def judged(
 ) -> dict[str, Any]:
     """Errors of fitted members, and of the selectors over them, under one policy."""
     members = {
-        name: HeldOut(model, recorded(models, folds, data.train, policy), policy)
+        name: HeldOut(model, recorded(models, model, folds, data.train, policy), policy)
         for name, (models, model) in fitted.items()
     }
     found: dict[str, Any] = {"models": {}}
@@ -205,10 +207,16 @@ def judged(
 
 
 def recorded(
-    models: list[Any], folds: list[tuple[Ints, Ints]], ds: TrajectoryDataset, policy: Any
+    models: list[Any],
+    whole: Any,
+    folds: list[tuple[Ints, Ints]],
+    ds: TrajectoryDataset,
+    policy: Any,
 ) -> dict[tuple[Any, ...], Forecast]:
-    """Forecasts of the episodes that each fold holds out, by their ids."""
+    """Forecasts of what each fold holds out, by ids of episodes; `whole` is fitted on all."""
     found = {}
+    if policy is None:
+        policy = policy_for_held_out(whole, ds)
     for model, (_, test) in zip(models, folds, strict=True):
         some = ds[test]
         with expected_warnings():

@@ -6,7 +6,7 @@ import pandas as pd
 from benchmarks.paper._command import Tables, markdown
 from benchmarks.regimes import _floor
 from benchmarks.regimes._members import RULES
-from benchmarks.regimes._regimes import DEVELOPMENT, FRESH, POLICIES
+from benchmarks.regimes._regimes import FRESH, POLICIES
 from benchmarks.regimes._tables import EXACT, in_order
 
 #: Goals that were set before the library's own forecasters were built: cumulated error, and
@@ -43,7 +43,7 @@ def report(system: str, tables: Tables) -> str:
         "one or two episodes at the edge of stability may decide; typical: median over episodes, "
         "averaged over horizons. "
         "Median over seeds (least to greatest). A model that diverges has an infinite error; "
-        "a blank was not run.",
+        "a blank was not run. Peers may have been run on fewer seeds, see below.",
         "",
     ]
     for policy in POLICIES:
@@ -145,18 +145,19 @@ def _pair(line: "pd.Series[float]") -> str:
 
 
 def distribution(ratios: pd.DataFrame) -> pd.DataFrame:
-    """Ratios over all regimes, apart for seeds of development and fresh ones."""
+    """Ratios over all regimes, apart for fresh seeds and those that rules were chosen on."""
     lines = []
-    kinds = {"fresh": FRESH, "development": DEVELOPMENT}
+    fresh = ratios["seed"].isin(FRESH)
+    kinds = {"fresh": fresh, "others": ~fresh}
     for rule in RULES:
         for statistic in ("median", "mean"):
             for policy in POLICIES:
-                for kind, seeds in kinds.items():
+                for kind, of_kind in kinds.items():
                     some = ratios[
                         (ratios["rule"] == rule)
                         & (ratios["statistic"] == statistic)
                         & (ratios["policy"] == policy)
-                        & ratios["seed"].isin(seeds)
+                        & of_kind
                     ]
                     if some.empty:
                         continue
@@ -198,7 +199,8 @@ def peer_lines(peers: pd.DataFrame) -> pd.DataFrame:
     """Settings chosen most often, seconds, and failures of each peer."""
     lines = []
     for peer, some in peers.groupby("peer", sort=False):
-        line = {"peer": peer, "cells": str(len(some))}
+        seeds = ", ".join(map(str, sorted(some["seed"].unique())))
+        line = {"peer": peer, "seeds": seeds, "cells": str(len(some))}
         settings = some["settings"].dropna() if "settings" in some else pd.Series(dtype=str)
         settings = settings[settings != ""]
         line["chosen most often"] = settings.mode().iloc[0] if len(settings) else ""

@@ -22,16 +22,15 @@ from benchmarks.regimes._peer_messages import receive, send
 from benchmarks.regimes._regimes import REGIMES
 from benchmarks.regimes._scores import errors_of, scores
 from trajlearn import TrajectoryDataset
+from trajlearn.dynamics._selection.default_members import clipped_to
 
 Floats = NDArray[np.float64]
 Settings = dict[str, Any]
 
 #: Names in tables and legends, and the environment that each runs in; None is ours.
-ENVIRONMENT = {"PySINDy": "pysindy", "pykoop": "pykoop", "mbrl-lib": "mbrl", "GP": None}
+ENVIRONMENT = {"PySINDy": "pysindy", "pykoop": "pykoop", "mbrl-lib": "mbrl", "sklearn-GP": None}
 #: Rows that a GP is fitted on.
 GP_ROWS = 800
-#: States of a roll-out stay within this multiple of their training range, as our members' do.
-CLIP = 1.2
 # a library of functions has at most this many terms, as our polynomials
 _MOST_TERMS = 1000
 # folds of many episodes that candidates are compared on
@@ -110,9 +109,9 @@ def roll_out(model: OneStep, ds: TrajectoryDataset, limits: Floats, policy: Any)
 
 
 def limits_of(ds: TrajectoryDataset) -> Floats:
-    """A multiple of the training range about its centre (2, d_s)."""
+    """Multiples of the training range about its centre (2, d_s), as our members' roll-outs have."""
     low, high = ds.states.min(axis=0), ds.states.max(axis=0)
-    centre, half = (low + high) / 2, CLIP * (high - low) / 2
+    centre, half = (low + high) / 2, clipped_to(len(ds)) * (high - low) / 2
     return np.stack([centre - half, centre + half])
 
 

@@ -21,34 +21,38 @@ COLUMNS = {
     "poly1": "linear",
     "poly3": "cubic",
     "network": "network",
+    "gp": "GP",
     "poly1_em": "linear",
     "poly3_em": "cubic",
     "network_em": "network",
-    "poly1_latent": "latent velocities",
-    "poly1_window": "5 past states",
-    "poly1_em_sees": "noisy policy",
-    "C": "closed loop C",
-    "T": "trajectory T",
+    "poly1_latent": "latent\nvelocities",
+    "poly1_window": "5 past\nstates",
+    "poly1_em_sees": "noisy\npolicy",
+    "C": "closed\nloop C",
+    "T": "trajec-\ntory T",
     "PySINDy": "PySINDy",
     "pykoop": "pykoop",
     "mbrl-lib": "mbrl-lib",
-    "GP": "GP",
+    "sklearn-GP": "sklearn\nGP",
     "pick": "selector",
 }
-_GROUPS = {"one-step": 3, "denoised": 3, "linear": 3, "with θ": 2, "peers": 4, "": 1}
+_GROUPS = {"one-step": 4, "denoised": 3, "linear": 3, "with θ": 2, "peers": 4, "": 1}
 #: Short names of models in cells.
 _SHORT = {
     "poly1": "P1",
     "poly2": "P2",
     "poly3": "P3",
     "network": "net",
+    "gp": "GP",
     "poly1_em": "P1, den.",
     "poly2_em": "P2, den.",
     "poly3_em": "P3, den.",
     "network_em": "net, den.",
     "poly1_latent": "P1, latent",
     "poly2_latent": "P2, latent",
+    "poly3_latent": "P3, latent",
     "poly1_window": "P1, 5 states",
+    "network_window": "net, 5 states",
     "poly1_em_sees": "P1, den., sees",
 }
 # ratios from which a cell is as dark as it gets
@@ -88,7 +92,7 @@ def who_wins(scores: dict[str, pd.DataFrame], error: str) -> "Figure":
         ax.set_title(f"policy {policy}", loc="left", fontsize=11, pad=18)
     figure.supxlabel(
         f"{_ERRORS[error]} / that of the best single model of the row (framed)\n"
-        "median over seeds; hatched: not run",
+        "median over the seeds that a model was run on; hatched: not run",
         fontsize=9,
     )
     return figure
@@ -141,7 +145,7 @@ def _draw_map(ax: "Axes", table: pd.DataFrame) -> None:
                 inner = (j - 0.46, i - 0.44)
                 ax.add_patch(Rectangle(inner, 0.92, 0.88, fill=False, ec="black", lw=1.6))
     ax.set_yticks(range(len(table)), table.index, fontsize=8)
-    names = [COLUMNS[name].replace(" ", "\n", 1) for name in table.columns]
+    names = [COLUMNS[name] for name in table.columns]
     ax.set_xticks(range(len(names)), names, fontsize=7.5)
     ax.tick_params(length=0)
     edge = 0

@@ -7,7 +7,7 @@ import pandas as pd
 
 from benchmarks.regimes._members import RULES
 from benchmarks.regimes._regimes import REGIMES
-from benchmarks.regimes._scores import BLOCK_ENDS
+from benchmarks.regimes._scores import BLOCK_ENDS, block_of
 
 #: Errors below this count as equal: a hundred thousandth of the range.
 EXACT = 1e-10
@@ -27,10 +27,8 @@ CURVES = {
 }
 CURVE_MODELS = (
     *("T", "C", "network", "network_em", "poly3", "poly3_em", "poly1_latent"),
-    *("PySINDy", "GP", "pick"),
+    *("gp", "PySINDy", "sklearn-GP", "pick"),
 )
-# of the blocks, as shares of all horizons
-_WIDTHS = np.diff([0.0, *BLOCK_ENDS])
 BLOCKS = [f"block_{i}" for i in range(1, len(BLOCK_ENDS) + 1)]
 
 # (asked, found) of cells
@@ -97,7 +95,9 @@ def tables(system: str, ours: Found, peers: Found, floors: Found) -> dict[str, p
 
 def typical(scores: dict[str, Any]) -> float:
     """Median error over episodes, averaged over all horizons."""
-    return float(np.average(scores["blocks"], weights=_WIDTHS))
+    length = scores["curve"]["horizon"][-1]
+    horizons = [block_of(h, length) for h in range(1, length + 1)]
+    return float(np.average(scores["blocks"], weights=np.bincount(horizons)))
 
 
 def ratios(models: dict[str, dict[str, Any]]) -> list[dict[str, Any]]:
