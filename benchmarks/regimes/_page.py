@@ -104,6 +104,13 @@ def judged_seeds(scores: pd.DataFrame) -> list[int]:
     return sorted(fresh or run)
 
 
+def on_all_seeds(scores: pd.DataFrame) -> pd.DataFrame:
+    """Lines of the models that were run on every seed of their regime: others had easier ones."""
+    regime = ["regime", "policy"]
+    n_seeds = scores.groupby(regime)["seed"].transform("nunique")
+    return scores[scores.groupby([*regime, "model"])["seed"].transform("nunique") == n_seeds]
+
+
 def wide(
     system: str, scores: pd.DataFrame, column: str, floors: pd.DataFrame | None
 ) -> pd.DataFrame:
@@ -128,7 +135,7 @@ def goals(scores: pd.DataFrame, floors: pd.DataFrame | None) -> pd.DataFrame:
         some = scores[(scores["regime"] == regime) & (scores["policy"] == policy)]
         if some.empty:
             continue
-        over = some.groupby("model")[["cum", "reward"]].median()
+        over = on_all_seeds(some).groupby("model")[["cum", "reward"]].median()
         best = over.drop(index=list(RULES), errors="ignore")["cum"].idxmin()
         line = {"regime": regime, "policy": policy}
         line |= {"goal": f"{cum:.1g} / {reward:.1g}"}

@@ -7,7 +7,7 @@ import pandas as pd
 
 from benchmarks.paper._figures import draw_curve, horizon_axes, legend_below, over_seeds
 from benchmarks.regimes._members import RULES
-from benchmarks.regimes._page import judged_seeds
+from benchmarks.regimes._page import judged_seeds, on_all_seeds
 from benchmarks.regimes._regimes import POLICIES, REGIMES
 from benchmarks.regimes._tables import BLOCKS, CURVE_MODELS, CURVES, EXACT, in_order
 from trajlearn.plotting._style import GREY, tidy
@@ -92,21 +92,30 @@ def who_wins(scores: dict[str, pd.DataFrame], error: str) -> "Figure":
         ax.set_title(f"policy {policy}", loc="left", fontsize=11, pad=18)
     figure.supxlabel(
         f"{_ERRORS[error]} / that of the best single model of the row (framed)\n"
-        "median over the seeds that a model was run on; hatched: not run",
+        "on the same seeds, median over those a model was run on; hatched: not run",
         fontsize=9,
     )
     return figure
 
 
 def _ratios(scores: dict[str, pd.DataFrame], policy: str, error: str) -> pd.DataFrame:
-    """Error of each model (columns) over the least of a single one, by regime."""
+    """Error of each model (columns) over the least of a single one, by regime.
+
+    A ratio is taken within a seed, so that models that were run on some seeds only have no better
+    or worse ones.
+    """
     tables = []
     for system, table in scores.items():
         some = table[(table["policy"] == policy) & table["seed"].isin(judged_seeds(table))]
         if some.empty:
             continue
-        cum = some.pivot_table(error, "regime", "model", aggfunc="median", sort=False)
-        cum = cum.loc[in_order(system, cum.index)].clip(lower=EXACT)
+        some = some.assign(ratio=some[error].clip(lower=EXACT))
+        always = on_all_seeds(some[~some["model"].isin(RULES)])
+        least = always.groupby(["regime", "seed"])["ratio"].min().rename("least")
+        some = some.join(least, on=["regime", "seed"])
+        some["ratio"] /= some["least"]
+        cum = some.pivot_table("ratio", "regime", "model", aggfunc="median", sort=False)
+        cum = cum.loc[in_order(system, cum.index)]
         single = cum.drop(columns=list(RULES), errors="ignore").min(axis=1)
         cum.index = [_row_label(system, name) for name in cum.index]
         tables.append(cum.div(single.to_numpy(), axis=0))
@@ -216,11 +225,11 @@ def winners(scores: dict[str, pd.DataFrame]) -> "Figure":
 def _winners(
     scores: dict[str, pd.DataFrame], policy: str
 ) -> dict[tuple[str, str], dict[str, tuple[str, float]]]:
-    """The best single model and its error, by regime and block: median over seeds."""
+    """The best single model run on all seeds, and its median error, by regime and block."""
     found = {}
     for system, table in scores.items():
         some = table[(table["policy"] == policy) & table["seed"].isin(judged_seeds(table))]
-        some = some[~some["model"].isin(RULES)]
+        some = on_all_seeds(some[~some["model"].isin(RULES)])
         for regime, lines in some.groupby("regime", sort=False):
             over = lines.groupby("model")[BLOCKS].median()
             best = over.idxmin()

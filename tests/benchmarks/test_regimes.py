@@ -8,13 +8,14 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from benchmarks.regimes import _floor, _members, _peers, regimes
+from benchmarks.regimes import _floor, _members, _peers, _pictures, regimes
 from benchmarks.regimes._episodes import episodes, scale
-from benchmarks.regimes._members import HeldOut, folds_of, recorded
+from benchmarks.regimes._members import RULES, HeldOut, folds_of, recorded
+from benchmarks.regimes._page import goals
 from benchmarks.regimes._peers import ROOT, Remote, Rows, candidates, limits_of, roll_out
 from benchmarks.regimes._regimes import POLICIES, REGIMES, SYSTEMS, Regime
 from benchmarks.regimes._scores import BLOCK_ENDS, block_of, errors_of, scores, shown_horizons
-from benchmarks.regimes._tables import EXACT, ratios, typical
+from benchmarks.regimes._tables import BLOCKS, EXACT, ratios, typical
 from benchmarks.regimes.regimes import BENCHMARK, MBRL, SEEDS, cells
 from trajlearn import Cartpole, OneStepRegressor, default_members
 from trajlearn.dynamics._selection.joint_folds import FoldFits
@@ -160,6 +161,21 @@ def test_ratios_of_exact_forecasts_are_one_and_of_lost_ones_infinite():
     assert ratios({"A": exact, "pick": curve([EXACT / 2], [EXACT / 9])})[0]["worst"] == 1
     assert ratios({"A": lost, "pick": lost})[0]["worst"] == 1
     assert ratios({"A": exact, "pick": lost})[0]["worst"] == np.inf
+
+
+def test_a_model_that_was_run_on_an_easy_seed_alone_wins_nothing():
+    lines = [("A", 1, 1e-6), ("B", 1, 2e-6), ("peer", 1, 1.5e-6), ("A", 2, 1e-2), ("B", 2, 2e-2)]
+    lines += [(rule, seed, error) for rule in RULES for _, seed, error in (lines[0], lines[3])]
+    table = pd.DataFrame(lines, columns=["model", "seed", "typical"])
+    table = table.assign(regime="clean", policy="known", cum=table["typical"], reward=1.0)
+    table = table.assign(**dict.fromkeys(BLOCKS, table["typical"]))
+    names = {"A": "T", "B": "C", "peer": "PySINDy"}
+    table["model"] = table["model"].replace(names)
+    ratio = _pictures._ratios({"cartpole": table}, "known", "typical").loc["clean"]
+    assert ratio[["T", "C", "PySINDy", "pick"]].tolist() == pytest.approx([1, 2, 1.5, 1])
+    best = _pictures._winners({"cartpole": table}, "known")["cartpole", "clean"]
+    assert {model for model, _ in best.values()} == {"T"}
+    assert goals(table, None)["best single"].item().startswith("T: ")
 
 
 # -- members ------------------------------------------------------------------------------
